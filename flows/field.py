@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.frame import FieldFrame, FieldLabels, FieldView
+from spectralzoom.flows.frame import FieldFrame, FieldLabels, FieldView, Prior
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RECORDED, RIG
 from spectralzoom.flows.tasks.observer import current_observer
 from spectralzoom.flows.tasks.patch_budget import SHARD
-from spectralzoom.flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
+from spectralzoom.flows.tasks.prior_maps import AUTO, NONE, find_prior
 from spectralzoom.flows.tasks.recorded_field import open_recorded, recorded_scene
 from spectralzoom.flows.tasks.rig_field import RigHold, rig_source
 from spectralzoom.flows.tasks.scene import (
@@ -36,7 +36,8 @@ from spectralzoom.flows.tasks.survey_model import (
     training_warning,
     weights_path,
 )
-from spectralzoom.flows.tasks.zones import SurveyZones, open_zones, place_of_field
+from spectralzoom.flows.tasks.zones import open_zones, place_of_field
+from spectralzoom.flows.zones import SurveyZones
 from spectralzoom.models.network.machine import choose_device
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.reading.regions import Region, plan_regions
@@ -45,7 +46,7 @@ from spectralzoom.pipeline.capture.recorded import Recording
 from spectralzoom.pipeline.errors import SceneError, SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
-from spectralzoom.pipeline.ground.field_places import PosedField
+from spectralzoom.pipeline.ground.field_places import FieldPlace, PosedField
 from spectralzoom.pipeline.ground.map_grid import GroundGrid
 from spectralzoom.pipeline.once import Once
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
@@ -54,8 +55,9 @@ from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Ra
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from spectralzoom.pipeline.source import Source
 from spectralzoom.pipeline.words import moment_of
+from spectralzoom.storage.arrays.raster_pixels import RasterPixels
 from spectralzoom.storage.readers.open_cubes import load_labels_array
-from spectralzoom.storage.readers.scene_files import RasterPixels, SceneFile
+from spectralzoom.storage.readers.scene_files import SceneFile
 from spectralzoom.storage.runs import dated
 from spectralzoom.storage.store import Archive
 
@@ -70,6 +72,7 @@ class Field:
     simulated: SimulatedSource  # without effects; for a rig, a model of its sizes, paths and memory
     model: SurveyModel
     grid: SceneGrid
+    place: FieldPlace
     zones: SurveyZones
     labels: FieldLabels
     hold: RigHold  # keeps other surveys from the rig
@@ -140,7 +143,7 @@ class Field:
     @property
     def ground_grid(self) -> GroundGrid | None:
         """Return the grid of the map on the ground; None without a pose."""
-        return self.zones.place.grid if isinstance(self.zones.place, PosedField) else None
+        return self.place.grid if isinstance(self.place, PosedField) else None
 
     @property
     def light(self) -> LineSpec:
@@ -181,7 +184,8 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
         raise SettingsError(refused)
     pixels, scene, notes = _scene_for(model, settings, recording, planning=planning)
     grid = SceneGrid(*scene.shape, model.described.config.patch)
-    zones = open_zones(settings, place_of_field(settings, scene), grid)
+    place = place_of_field(settings, scene)
+    zones = open_zones(settings, place, grid)
     raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
     outside = beyond_training(settings, scene, model.described, model.trained_on) if model.reads else []
     if raster is not None:
@@ -206,6 +210,7 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
         simulated=simulated,
         model=model,
         grid=grid,
+        place=place,
         zones=zones,
         labels=FieldLabels(
             Once(lambda: judged_labels(scene, model.described)),

@@ -16,7 +16,7 @@ from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.ground.georeference import georeference_record
 from spectralzoom.pipeline.once import Once
 from spectralzoom.storage.arrays.georeference import AngularGrid
-from spectralzoom.storage.store import array_digest
+from spectralzoom.storage.store import Ref, array_digest
 
 
 @dataclass(frozen=True)
@@ -65,3 +65,25 @@ class FieldLabels:
             return self.scene
         found = self.read()
         return "none" if found is None else array_digest(found)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The earlier run whose class probabilities a visit starts from."""
+
+    run: str
+    probabilities: Ref  # the store with class_probabilities.zarr
+    mosaic: Ref  # of that run
+    days: float  # between that visit and this one
+    day_of_year: float | None  # of this visit; None if it is unknown
+    classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
+
+    @property
+    def key(self) -> dict[str, object]:
+        """Return what a map depends on besides `stores`."""
+        return {"days": self.days, "day_of_year": self.day_of_year, "classes": self.classes}
+
+    @property
+    def stores(self) -> list[Ref]:
+        """Return the stores of earlier runs that a visit reads."""
+        return [self.probabilities, self.mosaic]

@@ -13,7 +13,7 @@ from spectralzoom.flows.stages.ground import STORE as GROUND_MAP
 from spectralzoom.flows.stages.locate import TIE_POINTS
 from spectralzoom.flows.stages.register import REGISTRATION
 from spectralzoom.flows.stages.score import SCORES
-from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES
+from spectralzoom.storage.arrays.class_maps import MAP, PROBABILITIES
 from spectralzoom.storage.store import Ref
 
 

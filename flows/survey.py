@@ -17,12 +17,13 @@ from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import KEEP_RAW, RIG
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse, capture_fine
-from spectralzoom.flows.stages.condense import condense_coarse, condense_fine, condense_raster
+from spectralzoom.flows.stages.condense import condense_coarse, condense_fine
 from spectralzoom.flows.stages.effects import choose_effects
 from spectralzoom.flows.stages.evaluate import evaluate
 from spectralzoom.flows.stages.ground import ground
 from spectralzoom.flows.stages.locate import locate
 from spectralzoom.flows.stages.overview import read_overview
+from spectralzoom.flows.stages.raster import condense_raster
 from spectralzoom.flows.stages.rectify import rectify, rectify_fine
 from spectralzoom.flows.stages.register import register_coarse, register_fine
 from spectralzoom.flows.stages.score import load_plan, score
@@ -31,7 +32,7 @@ from spectralzoom.flows.tasks.observer import Observer, current_observer, tidy_u
 from spectralzoom.flows.tasks.visit import settings_of_visit
 from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
-from spectralzoom.storage.readers.scene_files import RasterPixels
+from spectralzoom.storage.arrays.raster_pixels import RasterPixels
 from spectralzoom.storage.store import Archive, Ref
 
 

@@ -25,7 +25,7 @@ from scipy.ndimage import gaussian_filter
 
 from spectralzoom.flows.field import Field, open_field
 from spectralzoom.flows.settings.flags import AsJson, OutFile
-from spectralzoom.flows.settings.settings import Settings, SignalChoice, load_settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.settings.values import RASTER
 from spectralzoom.flows.tasks.scene import check_labels
 from spectralzoom.flows.terminal.figures import counted, format_bytes
@@ -60,8 +60,10 @@ from spectralzoom.pipeline.rectify.kernels import Kernel
 from spectralzoom.pipeline.rectify.region import mosaic_rows
 from spectralzoom.pipeline.rectify.resample import resample
 from spectralzoom.pipeline.signal.calibrate import calibrate
-from spectralzoom.pipeline.signal.condense import score_lines, whole_steps
+from spectralzoom.pipeline.signal.components import SignalChoice
+from spectralzoom.pipeline.signal.condense import score_lines
 from spectralzoom.pipeline.signal.lines import BLOCK_LINES
+from spectralzoom.pipeline.signal.rounding import whole_steps
 from spectralzoom.pipeline.signal.subspace import SignalStatistics, find_components
 from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
 from spectralzoom.pipeline.simulator.effects.probe import noise_electrons

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from spectralzoom.flows.frame import Prior
 from spectralzoom.flows.publish.quicklook import (
     AGAIN_RGB,
     READ_RGB,
@@ -23,7 +24,6 @@ from spectralzoom.flows.publish.quicklook import (
     thinned,
     webp,
 )
-from spectralzoom.flows.tasks.prior_maps import Prior
 from spectralzoom.flows.terminal.figures import format_days, format_percent, spaced
 from spectralzoom.pipeline.errors import visible
 from spectralzoom.pipeline.geometry.grid import UNLABELLED

@@ -16,9 +16,8 @@ from spectralzoom.flows.stages.condense import SIGNAL_RECORD
 from spectralzoom.flows.stages.ground import STORE
 from spectralzoom.flows.stages.register import load_registration
 from spectralzoom.flows.stages.score import load_plan, read_in_full
-from spectralzoom.flows.stages.segment import SPECTRA
+from spectralzoom.flows.stages.segment import PRIOR_FIGURES, SPECTRA
 from spectralzoom.flows.tasks.capture_plan import as_figures
-from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES
 from spectralzoom.flows.tasks.scores import MOST_ERROR
 from spectralzoom.flows.terminal.figures import format_count, format_points
 from spectralzoom.models.evaluation.expected_scores import ENOUGH_PX, expected_counts
@@ -108,7 +107,7 @@ def field_figures(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, Any]:
     zones, and hectares per hour refer to all capture time. A raster has neither capture time nor lines.
     """
     zones, passes = plan.field.zones, plan.passes
-    scale = kept = zones.place.scale(plan.field.camera.ifov_rad)
+    scale = kept = plan.field.place.scale(plan.field.camera.ifov_rad)
     if zones.kept is not None and scale.area_m2 is not None:
         kept = replace(scale, area_m2=_ground_m2(plan, zones.kept))  # the area within the zones
     footprint = scale.footprint
@@ -207,7 +206,7 @@ def _areas(plan: SurveyPlan, products: Products, posed: GroundMap | None, drawn:
     With a pose, places and hectares are those of the map on the ground.
     """
     pixels = class_counts(drawn.classes, len(drawn.names)).tolist()
-    m2 = None if posed is not None else areas_by_number(plan.field.zones.place, drawn.classes, len(drawn.names))
+    m2 = None if posed is not None else areas_by_number(plan.field.place, drawn.classes, len(drawn.names))
     hectares = {} if m2 is None else dict(zip(drawn.names, (m2 / M2_PER_HECTARE).tolist(), strict=True))
     geobox, classes = plan.field.scene.geobox, drawn.classes
     if posed is not None and products.ground is not None:
@@ -235,7 +234,7 @@ def _ground(
     old_class = ProbabilityStore(products.class_map.path / "class_probabilities.zarr").old_class()
     if old_class is not None:
         beyond = {(old, new): changed / differing for changed, differing, old, new in prior.get("changes", ())}
-        figures["changes_ha"] = changed_hectares(plan.field.zones.place, old_class, drawn, beyond)
+        figures["changes_ha"] = changed_hectares(plan.field.place, old_class, drawn, beyond)
     return figures
 
 
@@ -267,7 +266,7 @@ def _zones(plan: SurveyPlan, drawn: ClassMap) -> dict[str, Any]:
         found["zones"] = {"kept_px": pixels, "field_px": kept.size, "kept_m2": _ground_m2(plan, kept)}
     if zones.plots is not None:
         found["plots"] = [
-            asdict(figures_of_plot(name, shape, zones.place, drawn.classes, drawn.confidence, drawn.names))
+            asdict(figures_of_plot(name, shape, plan.field.place, drawn.classes, drawn.confidence, drawn.names))
             for name, shape in zones.plots.items()
         ]
     return found
@@ -275,7 +274,7 @@ def _zones(plan: SurveyPlan, drawn: ClassMap) -> dict[str, Any]:
 
 def _ground_m2(plan: SurveyPlan, kept: NDArray[np.bool_]) -> float | None:
     rows, columns = (slice(0, size) for size in kept.shape)
-    areas = plan.field.zones.place.pixel_areas_m2(rows, columns)
+    areas = plan.field.place.pixel_areas_m2(rows, columns)
     return None if areas is None else float(np.nansum(areas[kept]))
 
 

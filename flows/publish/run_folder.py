@@ -174,7 +174,7 @@ def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
     bands, caption = choose_bands(field.scene.wavelength_nm)
     found = load_class_map(products.class_map.path / "class_map.zarr")
     thin = thinned(found.classes)
-    scale = field.zones.place.scale(field.camera.ifov_rad)
+    scale = field.place.scale(field.camera.ifov_rad)
 
     def chosen(patches: NDArray[np.intp]) -> NDArray[np.bool_]:
         return by_pixels(field.grid, np.isin(field.grid.every_patch(), patches))[thin]

@@ -54,7 +54,6 @@ from spectralzoom.flows.settings.values import (
     Name,
     Scheduler,
     Size,
-    Tolerance,
     VisitName,
     Wavelengths,
 )
@@ -66,7 +65,9 @@ from spectralzoom.pipeline.geometry.scan import CostModel
 from spectralzoom.pipeline.ground.view import RigPose
 from spectralzoom.pipeline.rectify.kernels import Kernel
 from spectralzoom.pipeline.rig.device_settings import FAKE, SurveyRig
-from spectralzoom.pipeline.setting_fields import CONFIG, Text, settings_table, stated
+from spectralzoom.pipeline.setting_fields import CONFIG, Text, stated
+from spectralzoom.pipeline.signal.components import SignalChoice
+from spectralzoom.pipeline.simulator.effects.probe import Tolerance
 from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from spectralzoom.pipeline.simulator.scenes.built_in import LAWS
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, USUAL_DAY, USUAL_HOUR
@@ -76,16 +77,6 @@ OF_THE_MACHINE = ("scheduler", "workers", "bucket", "device")  # settings that d
 MOST_STEP = 8  # greatest line spacing [px]
 STORED = {"": "stored"}  # context of settings that were checked before: they are whole
 SCENE, TIME, OUTPUT, MACHINE = "Scene", "Time and accuracy", "Output", "Machine"  # groups of the help's first page
-
-
-@settings_table
-class SignalChoice:
-    """Limits of the spectral compression into components that exceed the noise."""
-
-    step: float = stated(1.0, "Quantisation step of the scores, in standard deviations of the noise", "", 0.01, 10)
-    false_alarm: float = stated(0.01, "Probability that noise alone yields a component in a field", "", 1e-6, 0.2)
-    rare_spectra: float = 1.0  # per sweep, that noise alone may mark as rare; rare spectra keep their residuals
-    least: int = 4  # components
 
 
 class Settings(BaseModel):

@@ -9,7 +9,6 @@ import math
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ByteSize, PlainSerializer, TypeAdapter, ValidationError
@@ -17,7 +16,7 @@ from pydantic import BeforeValidator, ByteSize, PlainSerializer, TypeAdapter, Va
 from spectralzoom.pipeline.errors import BudgetError
 from spectralzoom.pipeline.planning.partial_scans import LineRun
 from spectralzoom.pipeline.setting_fields import numbers_of, parse_text
-from spectralzoom.pipeline.simulator.effects.probe import Unit
+from spectralzoom.pipeline.simulator.effects.probe import Tolerance
 from spectralzoom.pipeline.simulator.render import BY_NAME
 from spectralzoom.pipeline.simulator.scenes.built_in import BUILT_IN_NAMES
 from spectralzoom.pipeline.simulator.selection.choice import named_effects
@@ -36,17 +35,6 @@ KEEP_SIGNAL, KEEP_RAW = "signal", "raw"
 _BYTES = TypeAdapter(ByteSize)
 _DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}(\s|$)|\d{4}-\d\d-\d\d(?!\d)")
 _NUMBER_AND_UNIT = re.compile(r"\s*([-+0-9.e]+)\s*(nm|[uµμ]m|micro[a-z]*)?\s*")
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """Greatest simulation error from omitted effects, in noise sigmas or in DN."""
-
-    value: float = 0.1
-    unit: Unit = "sigma"
-
-    def __str__(self) -> str:
-        return f"{self.value!r}" + ("" if self.unit == "sigma" else "dn")
 
 
 def parse_name(value: object) -> str:

@@ -3,47 +3,30 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spectralzoom.flows.frame import FieldFrame
-from spectralzoom.flows.settings.settings import SignalChoice
-from spectralzoom.flows.stage import Output, Report, Unkeyed, stage
+from spectralzoom.flows.stage import Output, Report, stage
 from spectralzoom.pipeline.errors import IncompleteStoreError, SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.readings import MOST_VALUE, readings_alone
 from spectralzoom.pipeline.signal.calibrate import number_values
-from spectralzoom.pipeline.signal.components import Components
-from spectralzoom.pipeline.signal.condense import (
-    RESIDUAL_STEP,
-    UNUSABLE,
-    CondensedSweep,
-    Condenser,
-    ResidualLaw,
-    differing_lines,
-    score_lines,
-)
+from spectralzoom.pipeline.signal.components import Components, SignalChoice
+from spectralzoom.pipeline.signal.condense import RESIDUAL_STEP, CondensedSweep, Condenser, ResidualLaw, differing_lines
 from spectralzoom.pipeline.signal.subspace import (
     FEW_BANDS,
     SignalStatistics,
     bands_alone,
     components_of_field,
-    components_of_raster,
     with_shared,
 )
-from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.source import RECORD
 from spectralzoom.storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
-from spectralzoom.storage.arrays.layout import SHARD_ROWS
-from spectralzoom.storage.arrays.mosaics import MosaicWriter
 from spectralzoom.storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from spectralzoom.storage.arrays.spool import line_values
-from spectralzoom.storage.readers.scene_files import RasterPixels
 from spectralzoom.storage.store import Ref, check_store, read_table, write_table
 
 MADE_BY = ("pipeline/signal", "storage/arrays/signal_cubes.py", "storage/arrays/mosaics.py")
@@ -193,50 +176,3 @@ def _lines_differ(passes: Sequence[Ref], signal: Ref, camera: LineCamera) -> str
         if wrong := differing_lines(cube, stored, camera, few):
             return f"sweep {cube.sweep.name}: {line_values(wrong)} of the signal are not those of the raw lines"
     return None
-
-
-@stage("signal of the raster", version=9, product="rectify", made_by=MADE_BY)
-def condense_raster(
-    out: Output,
-    *,
-    scene: RasterScene,
-    frame: FieldFrame,
-    signal: SignalChoice,
-    raster: Unkeyed[RasterPixels],
-    memory: Unkeyed[int],
-) -> None:
-    """Compress the pixels of a raster into its mosaic. They are read twice: for components, and for scores."""
-
-    def blocks() -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.bool_]]]:
-        """Yield blocks of rows: first row, values, validity."""
-        deep = max(raster.rows_at_once(memory) // SHARD_ROWS, 1) * SHARD_ROWS
-        for first in range(0, frame.grid.height, deep):
-            values = readings_alone(raster.rows(first, min(first + deep, frame.grid.height)), MOST_VALUE)
-            valid = np.isfinite(values)
-            yield first, values, valid.all(axis=2) if valid.all() else valid
-
-    found = SignalStatistics(raster.bands, frame.grid.height * frame.grid.width)
-    whole = True
-    for first, values, valid in blocks():
-        found.add(values, valid)
-        whole = whole and not np.nanmax(np.abs(values - np.rint(values)), initial=0)
-        out.report(0.5 * first / frame.grid.height)
-    components = components_of_raster(
-        found, frame.wavelength_nm, whole=whole, false_alarm=signal.false_alarm, least=signal.least
-    )
-    origin = np.zeros(raster.bands) if found.origin is None else found.origin
-    writer = MosaicWriter(
-        out.path / "mosaic.zarr",
-        (frame.grid.height, frame.grid.width),
-        components,
-        frame.wavelength_nm,
-        step=signal.step,
-        largest=components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean))),
-        fwhm_nm=frame.fwhm_nm,
-        grid=frame.angular_grid(),
-    )
-    for first, values, valid in blocks():
-        scored = score_lines(values, valid, components)
-        writer.write_rows(first, scored.scores, scored.quality != UNUSABLE)
-        out.report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)
-    writer.blank(frame.missing)

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from spectralzoom.flows.settings.values import Tolerance
 from spectralzoom.flows.stage import Output, stage
 from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
 from spectralzoom.pipeline.simulator.effects.effect import Effect
+from spectralzoom.pipeline.simulator.effects.probe import Tolerance
 from spectralzoom.pipeline.simulator.render import BY_NAME, EFFECTS
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.stage import Output, stage
-from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import PosedField, areas_by_number
 from spectralzoom.pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at
-from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ProbabilityStore, load_class_map
+from spectralzoom.storage.arrays.class_maps import MAP, OLD_CLASS, PROBABILITIES, ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from spectralzoom.storage.arrays.mosaics import choose_bands, develop, open_mosaic
 from spectralzoom.storage.store import Ref

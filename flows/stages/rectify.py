@@ -19,6 +19,7 @@ from spectralzoom.flows.stages.register import open_sweeps
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import exposing
+from spectralzoom.pipeline.kept import free_kept
 from spectralzoom.pipeline.rectify.kernels import Kernel
 from spectralzoom.pipeline.rectify.placed import PixelGrid, PlacedSweep
 from spectralzoom.pipeline.rectify.region import (
@@ -30,7 +31,6 @@ from spectralzoom.pipeline.rectify.region import (
     TileMaker,
     Values,
     cache_bytes,
-    free_tiles,
     opened_tiles,
     opened_work,
     plan_tiles,
@@ -194,7 +194,7 @@ def write_mosaic(
         writer.write_tile(place[0].start, place[1].start, *made)
 
     run_blocks(maker, [(tile.rows, tile.columns) for tile in tiles], pool, take=take, report=report)
-    free_tiles()
+    free_kept()
     return budget
 
 

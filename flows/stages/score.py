@@ -15,7 +15,7 @@ from spectralzoom.flows.stage import Output, Report, stage
 from spectralzoom.flows.stages.overview import OVERVIEWS
 from spectralzoom.flows.tasks.field_work import NO_PATCHES, FieldWork
 from spectralzoom.flows.tasks.patch_budget import PatchBudget
-from spectralzoom.flows.tasks.zones import SurveyZones
+from spectralzoom.flows.zones import SurveyZones
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.policies import SEEING_POLICIES, Scores, score_patches
 from spectralzoom.models.reading.inference import CoarsePrediction

@@ -8,18 +8,20 @@ from typing import Any
 
 import numpy as np
 
+from spectralzoom.flows.frame import Prior
 from spectralzoom.flows.stage import Output, stage
 from spectralzoom.flows.stages.overview import OVERVIEWS
 from spectralzoom.flows.stages.score import READING, PatchGains, load_plan
-from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, draw_field
-from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES, Prior
+from spectralzoom.flows.tasks.drawing import Drawing, FullReading, draw_field
 from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
 from spectralzoom.models.reading.prior_map import TemporalAgreement
 from spectralzoom.models.weights.files import ReaderPart
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays.class_maps import (
+    MAP,
     NOT_BELIEVED,
     OLD_CLASS,
+    PROBABILITIES,
     ClassNames,
     create_class_map,
     create_probabilities,
@@ -29,6 +31,7 @@ from spectralzoom.storage.arrays.mosaics import Attention, write_attention
 from spectralzoom.storage.store import Ref, write_table
 
 SPECTRA = "spectra.json"  # beside a map: pixels out of range, and distances from the training spectra
+PRIOR_FIGURES = "prior_map.json"  # beside a map: the figures of its prior map
 MADE_BY = (
     "models/network",
     "models/reading",

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
+from spectralzoom.flows.frame import Prior
 from spectralzoom.flows.tasks.field_work import (
     GAIN,
     FieldWork,
@@ -24,7 +25,6 @@ from spectralzoom.flows.tasks.field_work import (
     overview_file,
     seen_patches,
 )
-from spectralzoom.flows.tasks.prior_maps import Prior
 from spectralzoom.models.evaluation.unlike_scenes import STRIDE, SceneSpectra, TrainingSpectra
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.policies import class_errors, gain_of
@@ -52,6 +52,8 @@ from spectralzoom.models.reading.regions import Region
 from spectralzoom.models.weights.files import Weights
 from spectralzoom.pipeline.geometry.grid import pad_by_reflection, patch_pixels
 from spectralzoom.storage.arrays.class_maps import (
+    MAP,
+    PROBABILITIES,
     ProbabilityStore,
     packed_probabilities,
     write_class_tile,
@@ -61,7 +63,6 @@ from spectralzoom.storage.arrays.mosaics import Mosaic, chosen_patches, open_mos
 from spectralzoom.storage.parallel.pool import run_blocks
 from spectralzoom.storage.store import Ref
 
-MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
 MOST_OVERVIEWS = 16  # regions whose overviews are kept: 0.5 GB; they say how frequent each class is in the field
 ENOUGH_SEEN = 0.5  # least covered fraction of a patch at the edge of a partial scan
 

@@ -36,7 +36,7 @@ from spectralzoom.models.weights.checksummed_files import SEAL
 from spectralzoom.models.weights.files import Description, Weights, describe_weights, load_reader, load_weights
 from spectralzoom.pipeline.errors import WeightsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
-from spectralzoom.pipeline.rectify.region import free_tiles
+from spectralzoom.pipeline.kept import free_kept
 from spectralzoom.storage.arrays.mosaics import open_mosaic
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, Report, WorkerPool, memory_refusal, mib, run_blocks
 from spectralzoom.storage.store import Ref
@@ -173,7 +173,7 @@ def coarse_region(weights: Weights, mosaic: Ref, region: Region, capture: LineSp
 
     ``capture`` is the capture of pixels for which the mosaic has none.
     """
-    free_tiles()
+    free_kept()
     give_back_freed_memory()  # regions differ in size: their remainders would add up over a large field
     coarse = open_mosaic(mosaic.path / "mosaic.zarr")
     window = (region.read.rows, region.read.columns)

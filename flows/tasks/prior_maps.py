@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from odc.geo.geobox import GeoBox
 
+from spectralzoom.flows.frame import Prior
 from spectralzoom.flows.settings.load import anchor_paths
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, PART
@@ -21,38 +21,15 @@ from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore
 from spectralzoom.storage.arrays.georeference import load_geobox
 from spectralzoom.storage.runs import Run, dated, has_time, read_run
-from spectralzoom.storage.store import Archive, Ref, run_stem
+from spectralzoom.storage.store import Archive, run_stem
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous visit
 PROBABILITIES = "class_probabilities"  # a product of runs
-PRIOR_FIGURES = "prior_map.json"  # beside a map: the figures of its prior map
 OF_THE_LIGHT = (  # settings that two runs of the same captured light share
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
     *("extent", "scan_step", "scan_exposure_ms", "budget", "policy"),
 )
-
-
-@dataclass(frozen=True)
-class Prior:
-    """The earlier run whose class probabilities a visit starts from."""
-
-    run: str
-    probabilities: Ref  # the store with class_probabilities.zarr
-    mosaic: Ref  # of that run
-    days: float  # between that visit and this one
-    day_of_year: float | None  # of this visit; None if it is unknown
-    classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
-
-    @property
-    def key(self) -> dict[str, object]:
-        """Return what a map depends on besides `stores`."""
-        return {"days": self.days, "day_of_year": self.day_of_year, "classes": self.classes}
-
-    @property
-    def stores(self) -> list[Ref]:
-        """Return the stores of earlier runs that a visit reads."""
-        return [self.probabilities, self.mosaic]
 
 
 def find_prior(

@@ -33,7 +33,7 @@ from spectralzoom.pipeline.once import Once
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.storage.readers.scene_files import RasterPixels
+from spectralzoom.storage.arrays.raster_pixels import RasterPixels
 
 
 @dataclass(frozen=True)

@@ -2,56 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.zones import SurveyZones
 from spectralzoom.pipeline.errors import ZoneError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture, PosedField
 from spectralzoom.pipeline.ground.map_grid import ground_grid
 from spectralzoom.pipeline.ground.view import GroundView
-from spectralzoom.pipeline.ground.zones import Mask, extent_deg, on_field, patch_means, pixels_inside
+from spectralzoom.pipeline.ground.zones import extent_deg, on_field, pixels_inside
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.storage.readers.polygons import ZoneFile, place_on_earth, read_zones
-from spectralzoom.storage.store import array_digest
-
-
-@dataclass(frozen=True)
-class SurveyZones:
-    """Zones and plots on the pixels of a field."""
-
-    place: FieldPlace
-    grid: SceneGrid
-    kept: Mask | None = None  # (y, x) pixels inside the area; None: all of the field
-    plots: Mapping[str, BaseGeometry] | None = None  # by name, in pixels; None where there are none
-    notes: tuple[str, ...] = ()
-
-    @cached_property
-    def fractions(self) -> NDArray[np.float64] | None:
-        """Return the fraction of each patch inside zones (patch,); None: all of it."""
-        return None if self.kept is None else patch_means(self.kept, self.grid)
-
-    @property
-    def shown_patches(self) -> Mask | None:
-        """Return the patches (patch,) that hold a pixel to map, which lines have to show; None: all of them."""
-        return None if self.fractions is None else self.fractions > 0
-
-    @cached_property
-    def left_out(self) -> Mask | None:
-        """Return the pixels (y, x) outside of zones; None where there are none."""
-        return None if self.kept is None else ~self.kept
-
-    @cached_property
-    def key(self) -> dict[str, str]:
-        """Return the parameters of zones for store keys; empty without zones."""
-        return {} if self.kept is None else {"zones": array_digest(self.kept)}
 
 
 def place_of_field(settings: Settings, scene: RasterScene) -> FieldPlace:
@@ -91,7 +55,7 @@ def open_zones(settings: Settings, place: FieldPlace, grid: SceneGrid) -> Survey
             f"the area of {settings.area} contains no pixel centre: it is smaller than a pixel of this field; give a "
             "larger one, or leave it out"
         )
-    return SurveyZones(place, grid, None if inside is None or inside.all() else inside, plots, tuple(notes))
+    return SurveyZones(grid, None if inside is None or inside.all() else inside, plots, tuple(notes))
 
 
 def _format_beside(found: ZoneFile, place: GroundPlace) -> str:

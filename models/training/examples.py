@@ -36,7 +36,8 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_re
 from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
 from spectralzoom.pipeline.planning.coverage import cheapest_full
 from spectralzoom.pipeline.rectify.region import mosaic_rows
-from spectralzoom.pipeline.signal.condense import UNUSABLE, score_lines, whole_steps
+from spectralzoom.pipeline.signal.condense import UNUSABLE, score_lines
+from spectralzoom.pipeline.signal.rounding import whole_steps
 from spectralzoom.pipeline.signal.subspace import FEW_BANDS, SignalStatistics, components_of_raster
 from spectralzoom.pipeline.simulator.effects.effect import Chosen
 from spectralzoom.pipeline.simulator.render import EFFECTS

@@ -78,3 +78,8 @@ def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDA
     """Extend the first two axes to ``shape`` by reflection; one single pixel is repeated."""
     beyond = [(0, max(size - have, 0)) for size, have in zip(shape, image.shape, strict=False)]
     return np.pad(image, [*beyond, *[(0, 0)] * (image.ndim - len(shape))], mode="reflect")
+
+
+def patch_means(mask: NDArray[np.bool_], grid: SceneGrid) -> NDArray[np.float64]:
+    """Return the mean over the pixels of each patch that lie on the scene, (patch,)."""
+    return np.asarray(patch_pixels(grid, mask).mean(axis=(1, 2)) / grid.valid_fraction().ravel())

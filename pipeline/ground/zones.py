@@ -11,9 +11,9 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace
-from spectralzoom.pipeline.ground.georeference import WGS84, Floats
+from spectralzoom.pipeline.ground.georeference import WGS84
 
 Mask = NDArray[np.bool_]
 ROUND_THE_FIELD = 1.0  # times its size, on every side, within which polygons are converted
@@ -78,11 +78,6 @@ def pixels_inside(shapes: Sequence[BaseGeometry], size: tuple[int, int], *, orig
     place = rasterio.Affine.translation(origin[1], origin[0])
     found = rasterio_features.rasterize(given, out_shape=size, transform=place, dtype="uint8")
     return np.asarray(found, np.bool_)
-
-
-def patch_means(mask: Mask, grid: SceneGrid) -> Floats:
-    """Return the mean over the pixels of each patch that lie on the scene, (patch,)."""
-    return np.asarray(patch_pixels(grid, mask).mean(axis=(1, 2)) / grid.valid_fraction().ravel())
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
+from spectralzoom.pipeline.kept import kept
 from spectralzoom.pipeline.rectify.kernels import Kernel
 from spectralzoom.pipeline.rectify.mosaic import LocatedSweep, cut_runs, mosaic, read_part
 from spectralzoom.pipeline.rectify.placed import ColumnReach, PixelGrid, PlacedSweep, ScanPathReach, member_lines, place
@@ -176,13 +177,13 @@ class TileMaker:
         )
 
 
-@lru_cache(maxsize=1)
+@kept
 def opened_work(open_work: OpenWork) -> MosaicWork:
     """Open work once in this process."""
     return open_work()
 
 
-@lru_cache(maxsize=1)
+@kept
 def opened_tiles(maker: TileMaker) -> tuple[MosaicWork, LineCache, Callable[[int, int], Reaches]]:
     """Return the work, the cache of lines and the reach of columns; only those of the last maker are kept."""
     work = opened_work(maker.open)
@@ -190,9 +191,3 @@ def opened_tiles(maker: TileMaker) -> tuple[MosaicWork, LineCache, Callable[[int
         lambda start, stop: column_reach(work.placed, work.camera, work.grid, slice(start, stop))
     )
     return work, LineCache(maker.cache), reach
-
-
-def free_tiles() -> None:
-    """Free the memory of the last mosaic's raw lines in this process."""
-    opened_tiles.cache_clear()
-    opened_work.cache_clear()

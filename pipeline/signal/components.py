@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spectralzoom.pipeline.setting_fields import settings_table, stated
+
 BROAD_BANDS = 16
 BLOCK = 4  # spectra a side of a mean
 
@@ -109,3 +111,13 @@ def broad_weights(components: Components, bands: int = BROAD_BANDS) -> tuple[NDA
         matrix[chosen] = 1 / len(chosen)
     weights, offset = components.onto(matrix)
     return weights[:, 0], offset[0]
+
+
+@settings_table
+class SignalChoice:
+    """Limits of the spectral compression into components that exceed the noise."""
+
+    step: float = stated(1.0, "Quantisation step of the scores, in standard deviations of the noise", "", 0.01, 10)
+    false_alarm: float = stated(0.01, "Probability that noise alone yields a component in a field", "", 1e-6, 0.2)
+    rare_spectra: float = 1.0  # per sweep, that noise alone may mark as rare; rare spectra keep their residuals
+    least: int = 4  # components

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
@@ -20,6 +19,7 @@ from spectralzoom.pipeline.readings import SIGMA_OF_MEDIAN
 from spectralzoom.pipeline.signal.calibrate import Bools, calibrate, judge_elements
 from spectralzoom.pipeline.signal.components import Components, Scores
 from spectralzoom.pipeline.signal.lines import BLOCK_LINES, CondensedLines
+from spectralzoom.pipeline.signal.rounding import whole_steps
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
 from spectralzoom.pipeline.source import Line, References, SweepLines
 
@@ -32,7 +32,6 @@ LEAST_EXPECTED = 0.2  # of the mean residual: least prediction of the law, ...
 LEAST_RESIDUAL = 0.02  # ... and of the noise's variance: less is rounding
 CANCELLED = 1e-4  # of a spectrum's square: a smaller difference of squares has lost digits of float32
 SPECTRA_AT_ONCE = 256  # projected at a time: they stay in cache
-MEAN_SIDE = 4  # of the blocks of spectra whose means are kept where scores are rounded coarsely
 RESIDUAL_STEP = 0.5  # in which residuals of rare spectra are kept [noise's deviations]
 
 SLACK, DIGITS = 1e-3, 1e-5  # of a step, and of a score, by which sums of float32 may differ
@@ -187,35 +186,6 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
 def _limit(freedom: float, false_alarm: float) -> float:
     """Return the mean square of noise, over its expectation, that is exceeded with a probability."""
     return float(scipy.special.chdtri(freedom, min(false_alarm, 0.5)) / freedom)
-
-
-def whole_steps(scores: NDArray[np.floating], step: float) -> NDArray[np.floating]:
-    """Round scores (line, sample, component) to whole steps; above the noise, blocks of 4 x 4 keep their means.
-
-    Rounding each score alone loses signals below a coarse step, although many spectra show them. So the errors of a
-    block are added, and as many scores as that sum are rounded the other way. Those nearest to the next number come
-    first (controlled rounding of tables: Cox 1987). No score is off by more than one step, and the mean of a block by
-    more than 1/32. Blocks that are incomplete, or have a score that is not finite, are rounded score by score.
-    """
-    side = MEAN_SIDE
-    steps = scores / np.float32(step)
-    rounded: NDArray[np.floating] = np.rint(steps)
-    lines, samples, count = (*(size // side * side for size in steps.shape[:2]), steps.shape[2])
-    if step <= 1 or not lines * samples * count:
-        return rounded
-    seen = np.isfinite(steps)
-
-    def by_block(image: NDArray[Any]) -> NDArray[Any]:
-        blocks = image[:lines, :samples].reshape(lines // side, side, samples // side, side, count)
-        return blocks.transpose(0, 2, 4, 1, 3).reshape(-1, side**2)
-
-    off = by_block(np.subtract(steps, rounded, out=np.zeros_like(steps), where=seen))
-    excess = np.where(by_block(seen).all(axis=1), np.rint(off.sum(axis=1)), 0).astype(np.int64)[:, None]
-    place = off.argsort(axis=1, kind="stable").argsort(axis=1, kind="stable")
-    moved = (place >= side**2 - excess).astype(np.int8) - (place < -excess)
-    moved = moved.reshape(lines // side, samples // side, count, side, side).transpose(0, 3, 1, 4, 2)
-    rounded[:lines, :samples] += moved.reshape(lines, samples, count)
-    return rounded
 
 
 def residual_steps(

@@ -22,6 +22,7 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
 from spectralzoom.storage.arrays import layout
 from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group
 
+MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}
 CONFIDENCE_STEP = 1 / 256
 STEP = 0.05  # nats

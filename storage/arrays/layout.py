@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.signal.components import Components
-from spectralzoom.pipeline.signal.condense import whole_steps
+from spectralzoom.pipeline.signal.rounding import whole_steps
 
 CHUNK_PX = 32
 SHARD_ROWS = 64

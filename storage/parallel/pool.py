@@ -20,8 +20,6 @@ from typing import Any, TypeVar
 
 from spectralzoom.pipeline.errors import SettingsError, WorkerError
 from spectralzoom.pipeline.words import is_scheduler
-from spectralzoom.storage.remote.objects import Objects
-from spectralzoom.storage.remote.worker_stores import fetching_work
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
 RESTART_S = 60.0  # time limit until a process of this machine replaces one that died
@@ -78,6 +76,8 @@ class WorkerPool:
                     f"bucket {self.bucket} is for workers on other machines; give --scheduler tcp://host:port, or no "
                     "--bucket, and copy the archive by spectralzoom push"
                 )
+            from spectralzoom.storage.remote.objects import Objects  # imports obstore
+
             Objects(self.bucket)
 
     @property
@@ -203,6 +203,8 @@ def _run_away(pool: WorkerPool, make: Callable[[Any], Any], items: Sequence[Any]
     import dask.distributed as dask_distributed
 
     if pool.bucket is not None:
+        from spectralzoom.storage.remote.worker_stores import fetching_work  # imports obstore
+
         make = fetching_work(make, pool.bucket)
     cluster = _clusters[pool] = _clusters[pool] or Cluster(pool)
     lost = (WorkerError, CancelledError, dask_distributed.KilledWorker)

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError
-from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
+from spectralzoom.pipeline.geometry.grid import cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from spectralzoom.pipeline.signal.line_faults import CURE, DARK_LINE, counted, leave_out
-from spectralzoom.storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from spectralzoom.storage.readers.band_facts import Bands, bands_text
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
@@ -42,9 +41,7 @@ from spectralzoom.storage.readers.scene_toml import (
 from spectralzoom.storage.readers.user_files import reading_files
 
 USUAL_NODATA = -9999.0  # assumed where no file states another
-COPIES = 6  # of a block in memory while it is read and processed
 FOUND = f'; they were found by their name: labels = "" in a {SETTINGS_NAME} beside the scene leaves them out'
-FRACTION = 4  # of the free memory for a block: larger ones are no faster
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -383,29 +380,3 @@ def empty_bands(source: CubeSource, settings: SceneSettings) -> tuple[int, ...]:
             break
         empty &= ~np.isfinite(values.converted(rows.start, rows.stop)[1]).any(axis=(0, 1))
     return tuple(np.flatnonzero(empty).tolist())
-
-
-@dataclass(frozen=True)
-class RasterPixels:
-    """The pixels of a raster: ``read`` returns rows (y, x, band) in float32, NaN without a value."""
-
-    read: Callable[[int, int], NDArray[np.float32]]
-    missing: NDArray[np.bool_]  # (y, x) without a value
-    bands: int
-    grid: SceneGrid
-
-    def rows(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Read rows of the raster, NaN in every band of the missing pixels."""
-        values = self.read(start, stop)
-        values[self.missing[start:stop]] = np.nan
-        return values
-
-    def rows_at_once(self, memory: int) -> int:
-        """Return the rows to read at a time: whole rows of patches (SettingsError: one does not fit the memory)."""
-        deep = self.grid.patch
-        block = deep * COPIES * self.grid.width * self.bands * 4
-        least = RESERVED_BYTES + block
-        if least > memory:
-            why = f"{deep} rows of a raster of {self.grid.width} px and {self.bands} bands are read at a time"
-            raise memory_refusal(least, memory, why)
-        return deep * max(1, (memory - RESERVED_BYTES) // FRACTION // block)

@@ -197,7 +197,7 @@ def test_an_area_of_the_whole_field_changes_no_key(
 
 def test_polygons_in_any_crs_give_the_same_mask(opened: Opened, tmp_path: Path) -> None:
     """The far half of the field is given in metres, in degrees, in web Mercator and in LAEA (axes north, east)."""
-    place = opened(pose=POSE).field.zones.place
+    place = opened(pose=POSE).field.place
     west, south, east, north = place.outline.bounds
     half = shapely.intersection(place.outline, shapely.box(west, (south + north) / 2, east, north))
     fine = geopandas.GeoSeries([half], crs=place.crs).segmentize((east - west) / 500)

@@ -152,3 +152,14 @@ def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArra
     out[..., :-1] = steep
     np.maximum(out[..., 1:], steep, out=out[..., 1:])
     return out
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Greatest simulation error from omitted effects, in noise sigmas or in DN."""
+
+    value: float = 0.1
+    unit: Unit = "sigma"
+
+    def __str__(self) -> str:
+        return f"{self.value!r}" + ("" if self.unit == "sigma" else "dn")

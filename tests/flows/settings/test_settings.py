@@ -21,11 +21,11 @@ from spectralzoom.flows.settings.documents import example_toml, settings_table
 from spectralzoom.flows.settings.flags import KEYS, by_setting
 from spectralzoom.flows.settings.load import declared, nested
 from spectralzoom.flows.settings.settings import Settings, load_settings, parse_settings
-from spectralzoom.flows.settings.values import Tolerance
 from spectralzoom.pipeline.errors import BudgetError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import CostModel
 from spectralzoom.pipeline.ground.view import RigPose
+from spectralzoom.pipeline.simulator.effects.probe import Tolerance
 from spectralzoom.pipeline.simulator.render import EFFECTS
 from spectralzoom.pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
 from spectralzoom.storage.whole_files import to_json

@@ -11,18 +11,24 @@ import numpy as np
 import pytest
 
 from spectralzoom.flows.field import open_field
+from spectralzoom.flows.frame import Prior
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.settings.settings import load_settings
-from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES, Drawing, draw_field, prior_map_of
+from spectralzoom.flows.tasks.drawing import Drawing, draw_field, prior_map_of
 from spectralzoom.flows.tasks.field_work import FieldWork, Scoring, WeightsFile, overview_file
 from spectralzoom.flows.tasks.patch_budget import SHARD
-from spectralzoom.flows.tasks.prior_maps import Prior
 from spectralzoom.models.network.sizes import CELL_PX, TOKEN_PX
 from spectralzoom.models.reading.regions import plan_regions
 from spectralzoom.models.weights.files import describe_weights, load_weights, save_weights
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
-from spectralzoom.storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities
+from spectralzoom.storage.arrays.class_maps import (
+    MAP,
+    PROBABILITIES,
+    ClassNames,
+    create_class_map,
+    create_probabilities,
+)
 from spectralzoom.storage.arrays.layout import consolidate_stores, open_group, read_array
 from spectralzoom.storage.parallel.pool import WorkerPool
 from spectralzoom.storage.store import Ref

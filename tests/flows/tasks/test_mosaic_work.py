@@ -12,8 +12,9 @@ from spectralzoom.flows.stages.rectify import MosaicRecipe, tile_budget, write_m
 from spectralzoom.pipeline.errors import SettingsError, ShapeError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.kept import free_kept
 from spectralzoom.pipeline.rectify.placed import PixelGrid, place
-from spectralzoom.pipeline.rectify.region import MosaicWork, TileMaker, free_tiles, opened_tiles, plan_tiles
+from spectralzoom.pipeline.rectify.region import MosaicWork, TileMaker, opened_tiles, plan_tiles
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.arrays.cubes import SweepHeader
 from spectralzoom.storage.arrays.signal_cubes import SignalCube, open_signal_cubes
@@ -66,12 +67,12 @@ def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[SignalCube
 
 
 def test_a_worker_frees_its_raw_lines(cubes: list[SignalCube]) -> None:
-    """They stay in memory from tile to tile of a mosaic, until free_tiles."""
+    """They stay in memory from tile to tile of a mosaic, until free_kept."""
     maker = TileMaker(recipe_of(cubes).open, 2**24)
     maker((slice(0, 64), slice(0, 640)))
     lines = weakref.ref(opened_tiles(maker)[1])
     assert lines() is not None
-    free_tiles()
+    free_kept()
     assert lines() is None
 
 

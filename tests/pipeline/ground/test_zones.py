@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_means
 from spectralzoom.pipeline.ground.field_places import NoPlace, PlacedPicture, PosedField
 from spectralzoom.pipeline.ground.map_grid import ground_grid
 from spectralzoom.pipeline.ground.view import GroundView, RigPose
-from spectralzoom.pipeline.ground.zones import figures_of_plot, on_field, patch_means, pixels_inside
+from spectralzoom.pipeline.ground.zones import figures_of_plot, on_field, pixels_inside
 
 SHAPE = (60, 80)
 corners = st.lists(st.tuples(st.floats(-20, 100), st.floats(-20, 80)), min_size=3, max_size=8)

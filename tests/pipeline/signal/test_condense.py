@@ -18,8 +18,8 @@ from spectralzoom.pipeline.signal.condense import (
     find_rare,
     residual_steps,
     score_lines,
-    whole_steps,
 )
+from spectralzoom.pipeline.signal.rounding import whole_steps
 from spectralzoom.pipeline.signal.subspace import SignalStatistics, components_of_field, find_components
 from tests.pipeline.signal.made_spectra import Field, field_of, marked, restored, scored, statistics_of
 

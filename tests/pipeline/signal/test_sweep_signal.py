@@ -18,9 +18,9 @@ from spectralzoom.pipeline.signal.condense import (
     LineStatistics,
     ResidualLaw,
     differing_lines,
-    whole_steps,
 )
 from spectralzoom.pipeline.signal.lines import BLOCK_LINES
+from spectralzoom.pipeline.signal.rounding import whole_steps
 from spectralzoom.pipeline.signal.subspace import SignalStatistics, find_components
 from spectralzoom.pipeline.source import Line
 from tests.pipeline.signal.made_spectra import CAMERA, MadeLines, field_of, raw_of
