@@ -43,7 +43,7 @@ survey: $(BIN)/.ok
 
 # Runs a survey through a fake rig, and compares it with the simulated one.
 survey-rig: $(BIN)/.ok-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/flows/tasks/test_survey_rig.py -k lines_of_the_simulation
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/flows/surveys/test_survey_rig.py -k lines_of_the_simulation
 
 # Makes the first picture of README and pages: the quicklook of the first visit of `make survey`.
 picture: $(BIN)/.ok

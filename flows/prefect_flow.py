@@ -7,7 +7,7 @@
         survey(Settings(scene="farm", seconds=25))                          # once, now
         survey.serve("north", cron="0 6 * * *", parameters={"settings": {...}})   # every day at six
 
-`flows.survey` has the stages in their order. `survey_field` runs them without Prefect, whose import takes a second.
+`flows.survey` has the stages. `flows.survey_field` runs them without Prefect, whose import takes a second.
 
 No ``from __future__ import annotations`` here: Prefect reads the signatures.
 """
@@ -17,12 +17,12 @@ from typing import cast
 from prefect import flow
 from prefect.states import Completed
 
+from spectralzoom.flows.observer import current_observer, say_state
+from spectralzoom.flows.opening.visit import name_of_flow_run
 from spectralzoom.flows.publish.publishing import RunRef, outcome
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import inside_flow
-from spectralzoom.flows.survey import survey_field
-from spectralzoom.flows.tasks.observer import current_observer, say_state
-from spectralzoom.flows.tasks.visit import name_of_flow_run
+from spectralzoom.flows.survey_field import survey_field
 
 
 @flow(

@@ -7,13 +7,12 @@ survey resumes. `flows.prefect_flow` makes an ordinary Prefect flow of it, in wh
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import datetime
 
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import SurveyPlan, plan_survey
+from spectralzoom.flows.observer import Observer, current_observer, tidy_up
+from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.products import Control, Pass, Products
 from spectralzoom.flows.publish.publishing import RunRef, clear_intermediate, clear_raw, publish
-from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import KEEP_RAW, RIG
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse, capture_fine
@@ -28,31 +27,18 @@ from spectralzoom.flows.stages.rectify import rectify, rectify_fine
 from spectralzoom.flows.stages.register import register_coarse, register_fine
 from spectralzoom.flows.stages.score import load_plan, score
 from spectralzoom.flows.stages.segment import segment
-from spectralzoom.flows.tasks.observer import Observer, current_observer, tidy_up
-from spectralzoom.flows.tasks.visit import settings_of_visit
 from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.storage.arrays.raster_pixels import RasterPixels
 from spectralzoom.storage.store import Archive, Ref
 
 
-def survey_field(settings: Settings) -> RunRef:
-    """Survey a field; inside a Prefect flow the stages are its tasks.
+def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:
+    """Run the stages of a planned survey and publish its run; inside a Prefect flow the stages are its tasks.
 
     Returns the address of the published run, or of the last store if ``until`` of the settings stops the survey.
     Raises PipelineError: what is wrong, what is allowed, and what to do.
     """
-    started = datetime.now(UTC)
-    checked = settings_of_visit(settings)
-    if checked.source == RIG:
-        from spectralzoom.pipeline.rig.drivers import check_devices  # imports pyserial
-
-        check_devices(checked.rig)
-    return carry_out(plan_survey(open_field(checked)), started)
-
-
-def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:
-    """Run the stages of a planned survey and publish its run; returns and raises as `survey_field`."""
     observer = current_observer()
     archive = Archive.open(plan.settings.out)
     archive.reclaim()  # remove incomplete stores of killed runs
@@ -90,17 +76,19 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
     else:
         first = _first_pass(stores, plan, effects)
         mosaic = first.mosaic
-    overview = read_overview(stores, mosaic, work=plan.work, capture=plan.capture) if plan.reads_overview else None
+    overview = None
+    if plan.request.overview_first:
+        overview = read_overview(stores, mosaic, work=plan.reading.gains.work, capture=plan.capture)
     attention = score(
         stores,
         mosaic,
         overview,
-        gains=plan.gains,
-        second_pass=plan.second_pass,
-        scan_record=plan.scan_record,
-        scanned=plan.scanned,
-        budget=plan.budget,
-        least_gain=plan.least_gain,
+        gains=plan.reading.gains,
+        second_pass=plan.request.planner,
+        scan_record=plan.request.scan_record,
+        scanned=plan.request.scanned,
+        budget=plan.reading.budget,
+        least_gain=plan.reading.least_gain,
     )
     second = None
     if first is not None and not plan.passes.plain:
@@ -116,11 +104,11 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
         attention,
         overview,
         *(() if field.prior is None else field.prior.stores),
-        gains=plan.gains,
+        gains=plan.reading.gains,
         prior=field.prior,
-        reader=field.reader,
+        reader=plan.reading.reader,
         part=plan.part,
-        least_gain=plan.least_gain,
+        least_gain=plan.reading.least_gain,
         spectra=field.described.spectra,
     )
     return Products(
@@ -189,6 +177,7 @@ def _first_pass(stores: Stores, plan: SurveyPlan, effects: Ref | None) -> Pass:
     """Capture the first pass, or the uniform scan, and rectify it."""
     field, settings = plan.field, plan.settings
     assert field.source is not None
+    assert field.view is not None
     raw = capture_coarse(
         stores,
         effects,
@@ -231,6 +220,7 @@ def _second_pass(
     field, settings = plan.field, plan.settings
     sweeps = [] if request is None else request.sweeps
     assert field.source is not None
+    assert field.view is not None
     raw = capture_fine(
         stores,
         attention if request is not None else replace(attention, key=""),  # which leaves the lines open

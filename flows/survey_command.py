@@ -16,14 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from spectralzoom.flows.archive.plan_command import dry_run
-from spectralzoom.flows.publish.publishing import RunRef
-from spectralzoom.flows.publish.receipt import load_receipt
-from spectralzoom.flows.publish.receipt_table import print_summary
-from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.settings import Settings
-from spectralzoom.flows.stage import inside_flow
-from spectralzoom.flows.survey import carry_out, survey_field
-from spectralzoom.flows.tasks.local_server import (
+from spectralzoom.flows.local_server import (
     BOUNDED,
     QUIET,
     ServerUnavailable,
@@ -32,9 +25,17 @@ from spectralzoom.flows.tasks.local_server import (
     server_answers,
     silence_of,
 )
-from spectralzoom.flows.tasks.observer import Observer, observed_by
-from spectralzoom.flows.tasks.scene import farm_refusal
-from spectralzoom.flows.tasks.scores import warnings_of
+from spectralzoom.flows.observer import Observer, observed_by
+from spectralzoom.flows.opening.scene import farm_refusal
+from spectralzoom.flows.publish.publishing import RunRef
+from spectralzoom.flows.publish.receipt import load_receipt
+from spectralzoom.flows.publish.receipt_table import print_summary
+from spectralzoom.flows.publish.run_folder import Published
+from spectralzoom.flows.publish.scores import warnings_of
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.stage import inside_flow
+from spectralzoom.flows.survey import carry_out
+from spectralzoom.flows.survey_field import survey_field
 from spectralzoom.flows.terminal.progress import StageProgress, show_warnings
 from spectralzoom.models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
 from spectralzoom.pipeline.errors import SettingsError

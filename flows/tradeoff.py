@@ -23,15 +23,16 @@ from rich.console import Console
 from rich.markup import escape
 from scipy.ndimage import gaussian_filter
 
-from spectralzoom.flows.field import Field, open_field
+from spectralzoom.flows.field import Field
+from spectralzoom.flows.opening.open_field import open_field
 from spectralzoom.flows.settings.flags import AsJson, OutFile
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.settings.values import RASTER
-from spectralzoom.flows.tasks.scene import check_labels
 from spectralzoom.flows.terminal.figures import counted, format_bytes
 from spectralzoom.flows.terminal.processes import writing
 from spectralzoom.flows.terminal.progress import on_stdout, print_json, show_text, stderr, table
 from spectralzoom.models.evaluation.metrics import confusion, mean_iou
+from spectralzoom.models.evaluation.taught_labels import check_labels
 from spectralzoom.models.network.machine import keep_freed_memory, one_thread
 from spectralzoom.models.network.sizes import TOKEN_PX
 from spectralzoom.models.network.spectral import LineSpec
@@ -351,10 +352,10 @@ def reading_of(field: Field, passes: Mapping[Setting, PlannedPass]) -> tuple[Run
     def read(plan: Setting) -> DrawnMap:
         one = passes[plan]
         coarse = replace(one.coarse, overview=None)
-        return segment(field.weights, coarse, coarse.patches(one.patch_index), one.patch_index)
+        return segment(field.model.load(), coarse, coarse.patches(one.patch_index), one.patch_index)
 
     def judge(plan: Setting, drawn: DrawnMap) -> Figures:
-        miou = mean_iou(confusion(labels, drawn.classes, field.weights.config.classes))
+        miou = mean_iou(confusion(labels, drawn.classes, field.model.load().config.classes))
         return Figures(1 - miou, passes[plan].bytes, passes[plan].seconds)
 
     return read, judge
@@ -399,7 +400,7 @@ def plan_scans(seed: int, scene: str | None = None, weights: Path | None = None)
         sweeps = uniform_sweeps(grid, field.camera, along, step=step, exposure_ms=exposure_ms)
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
         seen = [SimulatedSweep(field.simulated, sweep) for sweep in sweeps]
-        coarse = coarse_of_sweeps(seen, field.camera, bands, grid, field.weights, scan)
+        coarse = coarse_of_sweeps(seen, field.camera, bands, grid, field.model.load(), scan)
         size, seconds = raw_bytes(sweeps, field.camera, len(bands)), field.settings.cost.seconds(sweeps, field.camera)
         passes[name] = PlannedPass(coarse, grid.every_patch(), size, seconds)
     return reading_of(field, passes)
@@ -413,11 +414,13 @@ def plan_fractions(seed: int, scene: str | None = None, weights: Path | None = N
     if raster is not None:
         parts = cuts(grid.height, raster.rows_at_once(field.settings.memory))
         blocks = (raster.rows(part.start, part.stop) for part in parts)
-        coarse = read_coarse_prediction(field.weights, read_coarse_pass(field.weights, blocks, wavelength_nm, grid))
+        coarse = read_coarse_prediction(
+            field.model.load(), read_coarse_pass(field.model.load(), blocks, wavelength_nm, grid)
+        )
     else:
         _, full, _ = cheapest_full(grid, field.camera, field.settings.cost)
         seen = [SimulatedSweep(field.simulated, sweep) for sweep in full]
-        coarse = coarse_of_sweeps(seen, field.camera, wavelength_nm, grid, field.weights)
+        coarse = coarse_of_sweeps(seen, field.camera, wavelength_nm, grid, field.model.load())
     scores = score_patches(POLICY, coarse)
     passes: dict[Setting, PlannedPass] = {}
     for fraction in FRACTIONS:

@@ -127,7 +127,7 @@ class OpenedRun:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about the map: reasons to expect a poorer one. It then has no expected score."""
-        from spectralzoom.flows.tasks.scores import warnings_of
+        from spectralzoom.flows.publish.scores import warnings_of
 
         return tuple(warnings_of(self.receipt))
 

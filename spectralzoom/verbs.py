@@ -13,9 +13,9 @@ from pydantic import TypeAdapter, ValidationError
 
 import spectralzoom.opened as opened
 from spectralzoom.flows.archive.plan_command import plan_content
+from spectralzoom.flows.opening.recorded_field import usual_of_recording
 from spectralzoom.flows.settings.load import unnested
 from spectralzoom.flows.settings.settings import Settings, load_settings
-from spectralzoom.flows.tasks.recorded_field import usual_of_recording
 from spectralzoom.flows.terminal.processes import place_caches, send_no_analytics
 from spectralzoom.flows.terminal.progress import Listener, heard_by, on_stderr
 from spectralzoom.opened import OpenedRun

@@ -10,12 +10,12 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from spectralzoom.flows.publish.scores import score_of, warnings_of
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Switch
 from spectralzoom.flows.settings.load import flag_of
 from spectralzoom.flows.settings.rules import OF_THE_PLAN
 from spectralzoom.flows.settings.settings import Settings, to_state
 from spectralzoom.flows.settings.values import ALWAYS, RECORDED
-from spectralzoom.flows.tasks.scores import score_of, warnings_of
 from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_points
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, stderr, table

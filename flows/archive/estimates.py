@@ -8,15 +8,17 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 
 from spectralzoom.flows.plan import SurveyPlan
-from spectralzoom.flows.tasks.scores import MOST_ERROR, format_prediction
+from spectralzoom.flows.publish.scores import MOST_ERROR, format_prediction
 from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_count, format_seconds, known_number
 from spectralzoom.flows.terminal.progress import table
-from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, raw_bytes
+from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, patches_shown, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
-from spectralzoom.pipeline.planning.uniform_scans import format_scan
+from spectralzoom.pipeline.planning.uniform_scans import MIOU, format_scan
 from spectralzoom.storage.runs import Run, read_run
 from spectralzoom.storage.store import Archive, is_archive, run_stem
 
@@ -88,24 +90,36 @@ def estimate_survey(plan: SurveyPlan, fine: FinePlan | None, unscored: str) -> d
 
 def _work(plan: SurveyPlan, fine: FinePlan | None) -> Estimate:
     """Return the multiply-adds with the patches that an earlier run of the field read, or that other scenes needed."""
-    likely = plan.likely_readings
-    if plan.least_gain is None:  # patches are chosen before the map is drawn
+    likely = plan.reading.likely()
+    if plan.reading.least_gain is None:  # patches are chosen before the map is drawn
         patch_index = likely[0] if fine is None or not fine.sweeps else fine.patch_index
-        work = plan.work_done(patch_index, None if fine is None else fine.changed).total
-        return Estimate(work, "network and field", fine is None and plan.chooses)
-    changed, source = plan.likely_changed if fine is None else fine.changed, "the patches that other scenes needed"
+        work = plan.reading.work_done(patch_index, None if fine is None else fine.changed).total
+        return Estimate(work, "network and field", fine is None and plan.reading.chooses)
+    changed, source = likely_changed(plan) if fine is None else fine.changed, "the patches that other scenes needed"
     if (run := _earlier_run(plan)) is not None:
         likely = (plan.field.kept_patches[: run.receipt["kept"]["patches"]],)
         source = f"the patches that {run.folder.name} read"
-    every = format_count(plan.work_done(plan.field.kept_patches, changed).total)
-    work, *ends = (plan.work_done(some, changed).total for some in likely)
+    every = format_count(plan.reading.work_done(plan.field.kept_patches, changed).total)
+    work, *ends = (plan.reading.work_done(some, changed).total for some in likely)
     return Estimate(work, f"{source}; {every} with every patch", range=None if len({*ends}) < 2 else (ends[0], ends[1]))
+
+
+def likely_changed(plan: SurveyPlan) -> NDArray[np.intp] | None:
+    """Return the patches of which a second pass shows a part if all of them gain alike; None for a uniform scan."""
+    planner, record, patches = plan.request.planner, plan.request.scan_record, plan.field.grid.every_patch()
+    if planner is None:
+        return None
+    alike = np.isin(patches, plan.field.kept_patches) / len(patches)
+    fine = planner.by_score(alike)
+    if record is not None:
+        fine = planner.best(record, lambda *scan: alike * record.expected(*scan)[MIOU])
+    return np.flatnonzero(patches_shown(fine.sweeps, plan.field.grid, planner.camera))
 
 
 def _earlier_run(plan: SurveyPlan) -> Run | None:
     """Return the newest run of the same field that chose patches by the same gain."""
     field, settings = plan.field, plan.settings
-    alike = plan.reading_figures(field.kept_patches)
+    alike = plan.reading.figures(field.kept_patches)
     folders = Archive(Path(settings.out).absolute()).runs() if is_archive(settings.out) else []
     for run in (read_run(one) for one in reversed(folders) if run_stem(field.name) in one.name):
         if (run.receipt.get("survey"), run.settings.get("seed")) == (field.name, settings.seed):
@@ -126,8 +140,8 @@ def _of_camera(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, Estimate]:
     bands = len(plan.field.scene.wavelength_nm)
     captured = raw_bytes([*plan.passes.coarse, *(fine.sweeps if fine else ())], camera, bands)
     open_end = fine is None and not plan.passes.plain
-    if fine is None and (second := plan.second_pass) is not None:
-        record = None if plan.field.recorded else plan.scan_record
+    if fine is None and (second := plan.request.planner) is not None:
+        record = None if plan.field.recorded else plan.request.scan_record
         left = raw_bytes(second.swaths, camera, bands) - second.interlaces * captured
         offered_ms = second.recorded_ms or ((camera.exposure_ms,) if record is None else record.offered_ms(camera))
         lines = int(plan.passes.fine_s / (replace(camera, exposure_ms=offered_ms[0]).frame_ms * 1e-3))
@@ -148,15 +162,15 @@ def _score(plan: SurveyPlan) -> Estimate:
         source = f"the weights' record of such scans, {counted(scenes, 'scene')}"
         if scan.spread is not None and scan.spread > MOST_ERROR:
             return Estimate(None, f"{source}; the scenes differ too much")
-        return Estimate(scan.expected["mIoU"], source, at_most=plan.budget is not None, spread=scan.spread)
-    if (zoomed := plan.scans.two_passes) is not None and plan.scan_record is not None:
+        return Estimate(scan.expected["mIoU"], source, at_most=plan.reading.budget is not None, spread=scan.spread)
+    if (zoomed := plan.scans.two_passes) is not None and plan.request.scan_record is not None:
         return Estimate(zoomed.expected, "the weights' record of uniform scans and both passes", at_least=True)
     validation = plan.field.described.record.get("validation") or {}
     whole = known_number((validation.get("all") or {}).get("miou"))
     if whole is None:
         return Estimate(None, "no scene was kept for validation when the weights were trained")
     source = f"these weights on {counted(int(validation['scenes']), 'scene')} kept for validation, read whole"
-    return Estimate(whole, source, at_most=plan.chooses or not plan.passes.plain)
+    return Estimate(whole, source, at_most=plan.reading.chooses or not plan.passes.plain)
 
 
 def format_estimate(name: str, one: Mapping[str, Any]) -> str:

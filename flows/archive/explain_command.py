@@ -12,9 +12,9 @@ from rich.tree import Tree
 from spectralzoom.flows.archive.commands import command
 from spectralzoom.flows.archive.plan_command import dry_run
 from spectralzoom.flows.archive.reprocess_command import asked_again
+from spectralzoom.flows.publish.scores import warnings_of
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson
 from spectralzoom.flows.stage import Row
-from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import put_out, show_text, show_warnings
 from spectralzoom.pipeline.errors import PipelineError

@@ -27,8 +27,8 @@ from spectralzoom.flows.archive.export_layers import (
 from spectralzoom.flows.archive.export_mosaic import export_mosaic
 from spectralzoom.flows.archive.export_values import check_doses, spectral_layers, write_areas, write_polygons
 from spectralzoom.flows.archive.merged_maps import export_merged
+from spectralzoom.flows.publish.scores import warnings_of
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, OutFile, Switch, check_outside
-from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import print_json, show_warnings, stderr
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError, SettingsError

@@ -15,12 +15,12 @@ from affine import Affine
 from cyclopts import Parameter
 from odc.geo.geobox import GeoBox
 
+from spectralzoom.flows.opening.visit import time_of_visit
 from spectralzoom.flows.publish.receipt import Receipt, load_receipt
+from spectralzoom.flows.publish.scores import warnings_of
 from spectralzoom.flows.settings.flags import Switch, split_list
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RIG
 from spectralzoom.flows.stages.ground import colours_of
-from spectralzoom.flows.tasks.scores import warnings_of
-from spectralzoom.flows.tasks.visit import time_of_visit
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import zoomed_out

@@ -14,7 +14,7 @@ import shapely
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.flows.archive.export_layers import ExportedRun, geobox_of, layer_of, warning_tag
-from spectralzoom.flows.tasks.scores import warnings_of
+from spectralzoom.flows.publish.scores import warnings_of
 from spectralzoom.models.evaluation.metrics import stratified_fractions
 from spectralzoom.pipeline.errors import ArchiveError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts

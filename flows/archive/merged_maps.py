@@ -15,8 +15,8 @@ from rich.markup import escape
 
 from spectralzoom.flows.archive.export_layers import ExportedRun, map_layers, warning_tag
 from spectralzoom.flows.publish.receipt import load_receipt
+from spectralzoom.flows.publish.scores import warnings_of
 from spectralzoom.flows.settings.flags import check_outside
-from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.flows.terminal.processes import writing
 from spectralzoom.flows.terminal.progress import show_text, show_warnings
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError

@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
 from spectralzoom.flows.archive.estimates import LABELS, estimate_survey, format_estimate, scan_table
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import SurveyPlan, plan_survey
+from spectralzoom.flows.field import Field
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.opening.recorded_field import usual_of_recording
+from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.planning.capture_plan import as_figures
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.publish.findings import field_figures, map_warnings, no_expected_score
 from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.settings.flags import NO_FLAGS, AsJson, HelpAll, SurveyFlags, by_setting, print_every_flag
 from spectralzoom.flows.settings.settings import Settings, load_settings
-from spectralzoom.flows.settings.values import ALWAYS, WHOLE
+from spectralzoom.flows.settings.values import ALWAYS
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.score import load_plan, score
 from spectralzoom.flows.stages.segment import segment
 from spectralzoom.flows.survey import run_stages
-from spectralzoom.flows.tasks.capture_plan import as_figures
-from spectralzoom.flows.tasks.recorded_field import usual_of_recording
 from spectralzoom.flows.terminal.figures import format_count
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import put_out, show_warnings, table
@@ -86,13 +88,12 @@ def plan_content(settings: Settings) -> dict[str, Any]:
     zoomed = None if passes.plain else plan
     if passes.plain and plan.scans.two_passes is not None:  # which the planner considered
         zoomed = plan_survey(open_field(settings.but(zoom=ALWAYS), planning=True))
-    whole = plan.settings.but(extent=WHOLE)
-    uniform = replace(plan, settings=whole, passes=replace(passes, plain=True), extent=None)
-    work = uniform.work_done(uniform.likely_readings[0]).total  # of each uniform scan
+    uniform = plan.reading.of_whole_scan()
+    work = uniform.work_done(uniform.likely()[0]).total  # of each uniform scan
     best = None if passes.plain else plan.scans.best_in_time(passes.coarse_s + passes.fine_s)
     drawn = stores.rows[segment.name].ref if segment.name in stores.rows else None
     warnings = map_warnings(plan, drawn if drawn is not None and stores.has(drawn) else None)
-    unscored = no_expected_score(warnings, field.mapped_px)
+    unscored = no_expected_score(warnings, _mapped_px(field))
     figures = partial(as_figures, scored=not unscored, multiply_adds=work)
     rows = [
         {"stage": row.name, "state": row.state, "key": row.ref.key or None, "why": row.why}
@@ -109,16 +110,22 @@ def plan_content(settings: Settings) -> dict[str, Any]:
             "taken": figures(plan.scans.chosen),
             "reference": figures(plan.scans.reference),
             "best_in_time": figures(best),
-            "at_most": plan.budget is not None,  # the scores are of maps with everything read
+            "at_most": plan.reading.budget is not None,  # the scores are of maps with everything read
             "candidates": [figures(one) for one in frontier(plan.scans.offered)],
             "two_passes": None if zoomed is None else _two_passes(zoomed, fine, plan, unscored),
         },
         "field": field_figures(plan, fine),
         "estimate": estimate_survey(plan, fine, unscored),
     }
-    if passes.plain and plan.chooses:  # expected, of a uniform scan that is segmented in part
-        content["kept"] = plan.reading_figures(plan.likely_readings[0])
+    if passes.plain and plan.reading.chooses:  # expected, of a uniform scan that is segmented in part
+        content["kept"] = plan.reading.figures(plan.reading.likely()[0])
     return content
+
+
+def _mapped_px(field: Field) -> int:
+    """Return the pixels that can have a class: those with data within the zones."""
+    without = [one for one in (field.scene.missing, field.zones.left_out) if one is not None]
+    return int(np.count_nonzero(~np.logical_or.reduce([np.zeros(field.scene.shape, np.bool_), *without])))
 
 
 def _two_passes(zoomed: SurveyPlan, fine: FinePlan | None, taken: SurveyPlan, unscored: str) -> dict[str, Any]:

@@ -16,14 +16,14 @@ from rich.console import Console
 from rich.markup import escape
 
 from spectralzoom.flows.archive.plan_command import dry_run
+from spectralzoom.flows.opening.recorded_field import open_recorded, recorded_scene
+from spectralzoom.flows.opening.scene import open_map, open_scene
+from spectralzoom.flows.publish.scores import score_of, warnings_of
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers, WorkersBucket
 from spectralzoom.flows.settings.settings import OF_THE_MACHINE, Settings, load_settings, parse_settings
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RECORDED, RIG
 from spectralzoom.flows.stages.capture import capture_coarse, capture_fine
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.recorded_field import open_recorded, recorded_scene
-from spectralzoom.flows.tasks.scene import open_map, open_scene
-from spectralzoom.flows.tasks.scores import score_of, warnings_of
 from spectralzoom.flows.terminal.figures import counted, format_points, format_seconds
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import put_out, show_text, stderr

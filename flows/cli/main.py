@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _leave_server(code: int) -> None:
     """Send Prefect's last events and logs; exit at once with a code where its server does not take them."""
-    from spectralzoom.flows.tasks.local_server import sent
+    from spectralzoom.flows.local_server import sent
 
     if not sent(SENT_WITHIN_S):  # Python would wait for Prefect's threads, which try for minutes
         for stream in (sys.stdout, sys.stderr):

@@ -23,10 +23,10 @@ from pydantic import ValidationError
 
 from spectralzoom.flows.archive.plan_command import dry_run
 from spectralzoom.flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess_deployment
+from spectralzoom.flows.local_server import configured, local_server
+from spectralzoom.flows.opening.rig_field import RIG_LIMIT
 from spectralzoom.flows.prefect_flow import survey
 from spectralzoom.flows.settings.settings import Settings, load_settings
-from spectralzoom.flows.tasks.local_server import configured, local_server
-from spectralzoom.flows.tasks.rig_field import RIG_LIMIT
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import show_text
 from spectralzoom.pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError

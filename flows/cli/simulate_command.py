@@ -10,17 +10,17 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.markup import escape
 
-from spectralzoom.flows.field import make_source, view_of
-from spectralzoom.flows.plan import pool_of
+from spectralzoom.flows.observer import tidy_up
+from spectralzoom.flows.opening.open_field import make_source, view_of
+from spectralzoom.flows.opening.scene import darkness, farm_refusal, open_scene
+from spectralzoom.flows.planning.capture_plan import PassLayout
+from spectralzoom.flows.planning.plan_survey import pool_of
 from spectralzoom.flows.publish.receipt_table import print_effects
 from spectralzoom.flows.settings.flags import NO_SIMULATION_FLAGS, AsJson, SimulationFlags, Switch, by_setting
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.capture import SAVED_S, SweepRequest, capture_coarse
 from spectralzoom.flows.stages.effects import choose_effects, load_manifest
-from spectralzoom.flows.tasks.capture_plan import PassLayout
-from spectralzoom.flows.tasks.observer import tidy_up
-from spectralzoom.flows.tasks.scene import darkness, farm_refusal, open_scene
 from spectralzoom.flows.terminal.figures import counted, format_bytes, format_seconds
 from spectralzoom.flows.terminal.progress import StageProgress, print_json, stderr
 from spectralzoom.models.network.machine import keep_freed_memory

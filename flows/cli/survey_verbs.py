@@ -43,7 +43,7 @@ def survey(
     if help_all:
         return print_every_flag()
     from spectralzoom.flows.cli.tiles import COLUMNS, tiles_of  # numpy and readers take a second
-    from spectralzoom.flows.tasks.recorded_field import usual_of_recording
+    from spectralzoom.flows.opening.recorded_field import usual_of_recording
 
     files = settings or (None,)
     loaded = [(str(file), load_settings(file, by_setting(flags), usual=usual_of_recording)) for file in files]

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from spectralzoom.flows.opening.scene import DATE, check_scene_there
 from spectralzoom.flows.publish.run_folder import Published
+from spectralzoom.flows.publish.scores import format_prediction, warnings_of
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RASTER, SIM
-from spectralzoom.flows.tasks.scene import DATE, check_scene_there
-from spectralzoom.flows.tasks.scores import format_prediction, warnings_of
 from spectralzoom.flows.terminal.figures import format_percent, format_points, format_seconds, spaced
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.arrays.class_maps import load_class_map

@@ -11,7 +11,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.tasks.scene import check_labels, judged_labels, seen_in_training
 from spectralzoom.flows.training.data import (
     Report,
     SceneNotes,
@@ -21,6 +20,7 @@ from spectralzoom.flows.training.data import (
     untaught_note,
     zero_cure,
 )
+from spectralzoom.models.evaluation.taught_labels import check_labels, judged_labels, seen_in_training
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from spectralzoom.models.training.examples import normalised, observe_scene
 from spectralzoom.models.weights.checksummed_files import refusing
@@ -28,7 +28,7 @@ from spectralzoom.models.weights.files import CAPTURED, Description, Weights, de
 from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
-from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
+from spectralzoom.pipeline.simulator.scenes.laws import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 FARM_TEST_SCENES = 4

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.planning.capture_plan import as_figures
 from spectralzoom.flows.products import Products
 from spectralzoom.flows.publish.class_sentence import main_places
+from spectralzoom.flows.publish.scores import MOST_ERROR
 from spectralzoom.flows.stages.condense import SIGNAL_RECORD
 from spectralzoom.flows.stages.ground import STORE
 from spectralzoom.flows.stages.register import load_registration
 from spectralzoom.flows.stages.score import load_plan, read_in_full
 from spectralzoom.flows.stages.segment import PRIOR_FIGURES, SPECTRA
-from spectralzoom.flows.tasks.capture_plan import as_figures
-from spectralzoom.flows.tasks.scores import MOST_ERROR
 from spectralzoom.flows.terminal.figures import format_count, format_points
 from spectralzoom.models.evaluation.expected_scores import ENOUGH_PX, expected_counts
 from spectralzoom.models.evaluation.unlike_scenes import UNLIKE
@@ -47,8 +47,8 @@ def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
     prior, kept = None, None
     if field.prior is not None:
         prior = {"run": field.prior.run, **read_table(products.class_map.path / PRIOR_FIGURES)}
-    if plan.chooses and (plan.passes.plain or plan.least_gain is not None):
-        kept = plan.reading_figures(read_in_full(products.attention, products.class_map), fine.changed)
+    if plan.reading.chooses and (plan.passes.plain or plan.reading.least_gain is not None):
+        kept = plan.reading.figures(read_in_full(products.attention, products.class_map), fine.changed)
     warnings = map_warnings(plan, products.class_map)
     unscored = no_expected_score(warnings, int(np.count_nonzero(drawn.classes != UNLABELLED)))
     return {

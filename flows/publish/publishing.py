@@ -11,18 +11,18 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from spectralzoom.flows.local_server import server_answers
 from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.products import Control, Products
 from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.publish.receipt_table import finding_rows, format_score, headline
 from spectralzoom.flows.publish.report import render_markdown
 from spectralzoom.flows.publish.run_folder import Published, publish_run
+from spectralzoom.flows.publish.scores import warnings_of
 from spectralzoom.flows.settings.values import KEEP_SIGNAL
 from spectralzoom.flows.stage import Stores, inside_flow, task_in_flow
 from spectralzoom.flows.stages.condense import raw_differs
 from spectralzoom.flows.stages.score import load_plan
-from spectralzoom.flows.tasks.local_server import server_answers
-from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.storage.runs import Catalogue
 from spectralzoom.storage.store import Archive, Ref

@@ -11,8 +11,7 @@ from rich.markup import escape
 
 from spectralzoom.flows.publish.class_sentence import class_sentence
 from spectralzoom.flows.publish.receipt import Receipt
-from spectralzoom.flows.tasks.scene import TRAINING_SCENE
-from spectralzoom.flows.tasks.scores import format_prediction, format_worst_class, warnings_of
+from spectralzoom.flows.publish.scores import format_prediction, format_worst_class, warnings_of
 from spectralzoom.flows.terminal.figures import (
     counted,
     format_area,
@@ -27,6 +26,7 @@ from spectralzoom.flows.terminal.figures import (
     three_digits,
 )
 from spectralzoom.flows.terminal.progress import show_warnings, table
+from spectralzoom.models.evaluation.taught_labels import TRAINING_SCENE
 from spectralzoom.pipeline.planning.uniform_scans import format_scan
 from spectralzoom.pipeline.simulator.selection.choice import UNIT_NAMES
 

@@ -23,10 +23,10 @@ from spectralzoom.flows.publish.field_map import FieldMap
 from spectralzoom.flows.publish.quicklook import data_address
 from spectralzoom.flows.publish.receipt import Receipt
 from spectralzoom.flows.publish.receipt_table import finding_rows, format_reference, headline, saving_rows
-from spectralzoom.flows.tasks.scores import error_matrix, format_false_classes, warnings_of
+from spectralzoom.flows.publish.scores import error_matrix, format_false_classes, warnings_of
 from spectralzoom.flows.terminal.figures import format_percent, format_points
 from spectralzoom.pipeline.errors import visible
-from spectralzoom.storage.readers.open_cubes import split_variable
+from spectralzoom.storage.readers.addresses import split_variable
 from spectralzoom.storage.runs import LINE_PRODUCTS
 
 LEAFLET = "vendor/leaflet-1.9.4"  # leafletjs.com, BSD-2-Clause: unchanged from npm's registry

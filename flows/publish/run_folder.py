@@ -30,7 +30,7 @@ from spectralzoom.flows.stages.capture import SAVED_S
 from spectralzoom.flows.stages.effects import load_manifest
 from spectralzoom.flows.stages.evaluate import load_accuracy
 from spectralzoom.flows.stages.score import READING, SCORES, load_plan, read_in_full
-from spectralzoom.flows.tasks.scene import seen_in_training
+from spectralzoom.models.evaluation.taught_labels import seen_in_training
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
@@ -86,8 +86,8 @@ def make_receipt(
     stores: Stores, plan: SurveyPlan, products: Products, control: Control | None, uri: str, started: datetime
 ) -> Receipt:
     """Return the receipt of a run whose folder has the address ``uri``."""
-    read = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)  # a plan assumes `SMOOTH` of them
-    plan = replace(plan, costs=replace(plan.costs, bands=read))
+    read = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)
+    plan = replace(plan, reading=plan.reading.with_components(read))
     field = plan.field
     fine = load_plan(products.attention)
     effects = {} if products.effects is None else load_manifest(products.effects)
@@ -142,7 +142,7 @@ def control_figures(control: Control) -> dict[str, Any]:
         "scan": format_scan(plan.step, plan.passes.coarse[0].exposure_ms or plan.field.camera.exposure_ms),
         "capture_s": plan.passes.coarse_s,
         "kept": count_bytes(control.stores, plan, products, load_plan(products.attention))["kept"],
-        "multiply_adds": replace(plan, costs=replace(plan.costs, bands=components)).work_done(read).total,
+        "multiply_adds": plan.reading.with_components(components).work_done(read).total,
         **{name: figures.get(name) for name in ("miou", "overall_accuracy", "per_class_iou")},
     }
 
@@ -154,8 +154,8 @@ def _stage_row(row: Row) -> dict[str, Any]:
 
 def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
     """Return the costs against the full scan, and against reading every patch; for a raster the latter alone."""
-    did, patches = plan.work_done(read, fine.changed), plan.field.kept_patches
-    work = SavingEntry(did.total, plan.costs.of_map(patches).total).as_dict()
+    did, patches = plan.reading.work_done(read, fine.changed), plan.field.kept_patches
+    work = SavingEntry(did.total, plan.reading.costs.of_map(patches).total).as_dict()
     of_model: dict[str, Any] = {"multiply_adds": {**work, **asdict(did)}}
     if plan.field.described.config.corrected:  # there is a network that can read patches in full
         of_model = {"patches": SavingEntry(len(read), len(patches)).as_dict(), **of_model}

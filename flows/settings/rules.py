@@ -23,7 +23,7 @@ from spectralzoom.flows.settings.values import (
 )
 from spectralzoom.pipeline.planning.fine_pass import FIRST_STEPS
 from spectralzoom.pipeline.rig.device_settings import MOST_PAIRS
-from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_NAMES
+from spectralzoom.pipeline.simulator.scenes.laws import SCOUTING_NAMES
 
 if TYPE_CHECKING:
     from spectralzoom.flows.settings.settings import Settings

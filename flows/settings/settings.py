@@ -69,8 +69,7 @@ from spectralzoom.pipeline.setting_fields import CONFIG, Text, stated
 from spectralzoom.pipeline.signal.components import SignalChoice
 from spectralzoom.pipeline.simulator.effects.probe import Tolerance
 from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from spectralzoom.pipeline.simulator.scenes.built_in import LAWS
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, USUAL_DAY, USUAL_HOUR
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_SHAPE, LAWS, USUAL_DAY, USUAL_HOUR
 
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 OF_THE_MACHINE = ("scheduler", "workers", "bucket", "device")  # settings that depend on the machine of the survey

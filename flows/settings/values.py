@@ -18,7 +18,7 @@ from spectralzoom.pipeline.planning.partial_scans import LineRun
 from spectralzoom.pipeline.setting_fields import numbers_of, parse_text
 from spectralzoom.pipeline.simulator.effects.probe import Tolerance
 from spectralzoom.pipeline.simulator.render import BY_NAME
-from spectralzoom.pipeline.simulator.scenes.built_in import BUILT_IN_NAMES
+from spectralzoom.pipeline.simulator.scenes.laws import BUILT_IN_NAMES
 from spectralzoom.pipeline.simulator.selection.choice import named_effects
 from spectralzoom.pipeline.words import MOST_NAME, YEARS, is_field_name, is_scheduler, moment_of
 

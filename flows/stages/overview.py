@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from spectralzoom.flows.stage import Output, stage
-from spectralzoom.flows.tasks.field_work import FieldWork
+from spectralzoom.flows.stages.field_work import FieldWork
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.storage.store import Ref
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.frame import FieldFrame
+from spectralzoom.flows.planning.patch_budget import PatchBudget
 from spectralzoom.flows.stage import Output, Report, stage
+from spectralzoom.flows.stages.field_work import NO_PATCHES, FieldWork
 from spectralzoom.flows.stages.overview import OVERVIEWS
-from spectralzoom.flows.tasks.field_work import NO_PATCHES, FieldWork
-from spectralzoom.flows.tasks.patch_budget import PatchBudget
 from spectralzoom.flows.zones import SurveyZones
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.policies import SEEING_POLICIES, Scores, score_patches

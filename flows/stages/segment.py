@@ -10,9 +10,9 @@ import numpy as np
 
 from spectralzoom.flows.frame import Prior
 from spectralzoom.flows.stage import Output, stage
+from spectralzoom.flows.stages.drawing import Drawing, FullReading, draw_field
 from spectralzoom.flows.stages.overview import OVERVIEWS
 from spectralzoom.flows.stages.score import READING, PatchGains, load_plan
-from spectralzoom.flows.tasks.drawing import Drawing, FullReading, draw_field
 from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
 from spectralzoom.models.reading.prior_map import TemporalAgreement
 from spectralzoom.models.weights.files import ReaderPart

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.tasks.scene import scene_of_file
+from spectralzoom.flows.opening.scene import scene_of_file
 from spectralzoom.flows.terminal.figures import counted
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
-from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_LAW, built_in_laws, built_in_scene
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
+from spectralzoom.pipeline.simulator.scenes.built_in import built_in_scene
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_LAW, SCOUTING_LAW, TRIAL_LAW, built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.pipeline.simulator.scenes.trial import TRIAL_LAW
+from spectralzoom.storage.readers.addresses import split_variable
 from spectralzoom.storage.readers.label_files import (
     MatchedFiles,
     classes_of_files,
@@ -35,7 +35,7 @@ from spectralzoom.storage.readers.label_files import (
     scene_entries,
     scene_number,
 )
-from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
+from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS
 from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 

@@ -24,9 +24,10 @@ from spectralzoom.pipeline.errors import PipelineError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.toml_files import as_toml
 from spectralzoom.storage.readers import label_files
+from spectralzoom.storage.readers.addresses import split_variable
 from spectralzoom.storage.readers.band_facts import bands_text
 from spectralzoom.storage.readers.cube_sources import CubeSource
-from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.scene_files import empty_bands
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, load_scene_settings
 from spectralzoom.storage.whole_files import write_whole

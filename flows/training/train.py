@@ -64,9 +64,8 @@ from spectralzoom.models.weights.files import (
     with_record,
 )
 from spectralzoom.pipeline.errors import SettingsError
-from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_PIXEL_M, built_in_laws
 
 LABEL_ZERO = "label_zero"  # entry in a record
 CORRECTED_SCENES = 4  # labelled scenes, at least, whose classifiers a network corrects

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.settings.model_flags import NO_TRAIN_FLAGS, TrainFlags
-from spectralzoom.flows.tasks.scene import pack_mask
 from spectralzoom.flows.training.data import Report, SceneNotes, TrainingData, check_taught, trained_pixels
+from spectralzoom.models.evaluation.taught_labels import pack_mask
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS
@@ -20,7 +20,7 @@ from spectralzoom.models.training.examples import Example, normalised, observe_s
 from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
-from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
+from spectralzoom.pipeline.simulator.scenes.laws import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 DEEP_PATCH_PX = 32  # of frames of 512 px and more, whose objects are larger than a token

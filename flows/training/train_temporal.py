@@ -30,7 +30,8 @@ from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_NAMES
 
 SHAPE = (512, 640)  # (y, x) of a land
 FLAGS = ("train_temporal", "scenes", "steps", "minutes", "seed")  # that apply

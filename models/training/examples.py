@@ -42,7 +42,7 @@ from spectralzoom.pipeline.signal.subspace import FEW_BANDS, SignalStatistics, c
 from spectralzoom.pipeline.simulator.effects.effect import Chosen
 from spectralzoom.pipeline.simulator.render import EFFECTS
 from spectralzoom.pipeline.simulator.rig_model import Rig
-from spectralzoom.pipeline.simulator.scenes.built_in import LAWS
+from spectralzoom.pipeline.simulator.scenes.laws import LAWS
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from spectralzoom.pipeline.simulator.selection.choice import decide
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_survey

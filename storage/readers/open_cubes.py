@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text
 from spectralzoom.pipeline.signal.calibrate import check_frames
+from spectralzoom.storage.readers.addresses import split_variable
 from spectralzoom.storage.readers.array_cubes import open_arrays
 from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, find_zarr_store
 from spectralzoom.storage.readers.band_facts import Bands
@@ -28,15 +28,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
-_WITH_VARIABLE = re.compile(
-    r"(.+\.(?:(?:mat|zarr|npy)(?=:[^/\\:]+$)|nc4?|h5|hdf5|he5)):([^:]+)", re.IGNORECASE | re.DOTALL
-)
-
-
-def split_variable(address: str | Path) -> tuple[Path, str | None]:
-    """Return path and variable of ``scene.mat:cube``."""
-    found = _WITH_VARIABLE.fullmatch(str(address))
-    return (Path(address), None) if found is None else (Path(found[1]), found[2])
 
 
 def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image", "array", "none"]:

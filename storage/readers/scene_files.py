@@ -19,6 +19,7 @@ from spectralzoom.pipeline.errors import EmptySceneError, SceneError
 from spectralzoom.pipeline.geometry.grid import cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from spectralzoom.pipeline.signal.line_faults import CURE, DARK_LINE, counted, leave_out
+from spectralzoom.storage.readers.addresses import split_variable
 from spectralzoom.storage.readers.band_facts import Bands, bands_text
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
@@ -30,7 +31,7 @@ from spectralzoom.storage.readers.cube_sources import (
 )
 from spectralzoom.storage.readers.label_files import label_file, read_labels
 from spectralzoom.storage.readers.labels import Labels
-from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.scene_toml import (
     SETTINGS_NAME,
     ClassValue,

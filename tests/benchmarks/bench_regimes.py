@@ -29,11 +29,11 @@ from measure import Row
 from numpy.typing import NDArray
 from rich.console import Console
 
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import plan_survey
+from spectralzoom.flows.opening import scene as scenes
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks import scene as scenes
 from spectralzoom.pipeline.geometry.grid import patch_pixels
 from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 from measure import Row
 
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import SurveyPlan, plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.simulator.effects.effect import Chosen

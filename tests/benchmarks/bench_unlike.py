@@ -19,7 +19,7 @@ from measure import Row, data_folder, not_run, print_rows
 from numpy.typing import NDArray
 from PIL import Image
 
-from spectralzoom.flows.tasks.survey_model import shipped_weights
+from spectralzoom.flows.opening.survey_model import shipped_weights
 from spectralzoom.flows.training.data import farm_test_data
 from spectralzoom.flows.training.train_scenes import CAMERA
 from spectralzoom.models.evaluation.unlike_scenes import STRIDE, UNLIKE, TrainingSpectra
@@ -27,8 +27,7 @@ from spectralzoom.models.network.spectral import Normalisation, SpectralBasis, p
 from spectralzoom.models.training.examples import observe_scene
 from spectralzoom.models.weights.files import describe_weights, load_weights
 from spectralzoom.pipeline.geometry.grid import SceneGrid
-from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_LAW
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_LAW, SCOUTING_LAW
 
 TILE, TILE_SEEDS, FRAME_SEEDS, TRAINED = (29, 36), (31, 32, 33), (41, 42), 12
 FARMS, OTHER_DAYS, DARK_MS = 6, (20, 340), 3.0

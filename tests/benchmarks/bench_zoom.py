@@ -20,8 +20,8 @@ import numpy as np
 from measure import ROOT, Row
 from rich.console import Console
 
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.survey_command import run_survey
 

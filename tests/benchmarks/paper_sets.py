@@ -16,7 +16,7 @@ from measure import ROOT
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spectralzoom.flows.tasks.scene import scene_of_file
+from spectralzoom.flows.opening.scene import scene_of_file
 from spectralzoom.flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name
 from spectralzoom.flows.training.train_scenes import Common, network_config
 from spectralzoom.models.network.spectral import LineSpec, SpectralBasis

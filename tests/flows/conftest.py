@@ -19,8 +19,8 @@ import pytest
 from PIL import Image
 
 from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.local_server import CONSOLE, local_server
 from spectralzoom.flows.stage import Stage
-from spectralzoom.flows.tasks.local_server import CONSOLE, local_server
 from spectralzoom.storage.arrays.class_maps import load_class_map
 from spectralzoom.storage.runs import verify_everything
 from spectralzoom.storage.store import Archive

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spectralzoom.flows.local_server import ServerUnavailable, close_folder, local_server, private_files
 from spectralzoom.flows.stages.capture import KEPT
-from spectralzoom.flows.tasks.local_server import ServerUnavailable, close_folder, local_server, private_files
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError
 from spectralzoom.pipeline.source import Line
 from spectralzoom.storage.arrays.spool import FetchedFiles, Spool

@@ -13,8 +13,8 @@ from affine import Affine
 from PIL import Image
 
 from spectralzoom.flows.evaluate.frames import open_candidates, open_frames, sort_frames
+from spectralzoom.flows.opening.scene import open_scene
 from spectralzoom.flows.settings.settings import load_settings
-from spectralzoom.flows.tasks.scene import open_scene
 from spectralzoom.flows.training.data import load_data_set, open_training_data
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera

@@ -19,11 +19,11 @@ from PIL import Image
 import spectralzoom.storage.readers.recordings
 from spectralzoom.flows.archive.commands import gc
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
+from spectralzoom.flows.opening.recorded_field import as_its_run, usual_of_recording
 from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.recorded_field import as_its_run, usual_of_recording
 from spectralzoom.flows.terminal.processes import DONE, PARTLY
 from spectralzoom.models.weights.files import save_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
@@ -41,8 +41,8 @@ from tests.blocks import block_means
 from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene, random_weights
 from tests.envi_files import write_recorded_files
 from tests.flows.conftest import CommandLine, be_version, command_line
-from tests.flows.tasks.test_survey_rig import FAKE
-from tests.flows.tasks.test_uniform_scan import RECORD
+from tests.flows.surveys.test_survey_rig import FAKE
+from tests.flows.surveys.test_uniform_scan import RECORD
 from tests.prior_work import without_effects
 from tests.storage.readers.test_recordings import write_envi_cube
 from tests.storage.small_archive import flip

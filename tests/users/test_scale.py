@@ -11,14 +11,15 @@ import pytest
 import shapely
 
 from spectralzoom.flows.archive.plan_command import plan_content
+from spectralzoom.flows.opening.zones import place_of_field
 from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.settings.load import declared
 from spectralzoom.flows.settings.settings import Settings, load_settings
-from spectralzoom.flows.tasks.zones import place_of_field
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.ground.field_places import scale_of_pixels, scale_of_view
 from spectralzoom.pipeline.ground.view import GroundView, RigPose
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M, farm_scene
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_PIXEL_M
 from tests.conftest import Flags, Survey
 from tests.users.zone_sketches import sketch
 

@@ -15,8 +15,9 @@ import rasterio
 import shapely
 from affine import Affine
 
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import SurveyPlan, plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import load_settings, parse_settings
 from spectralzoom.pipeline.errors import SettingsError, ZoneError

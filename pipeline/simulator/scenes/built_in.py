@@ -26,11 +26,18 @@ from spectralzoom.pipeline.simulator.scenes.farm import land
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import FarmPlan, Painting, Tramlines, land_of, plan_field
 from spectralzoom.pipeline.simulator.scenes.farm.fields import draw_weeds, field_weeds, paint_fields, plant_weeds
 from spectralzoom.pipeline.simulator.scenes.farm.land import Field, Points
+from spectralzoom.pipeline.simulator.scenes.laws import (
+    FARM_LAW,
+    FARM_SHAPE,
+    LAWS,
+    SCOUTING_LAW,
+    TRIAL_LAW,
+    USUAL_DAY,
+    USUAL_HOUR,
+)
 from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene
-from spectralzoom.pipeline.simulator.scenes.trial import TRIAL_LAW, TRIAL_NAMES, trial_scene
+from spectralzoom.pipeline.simulator.scenes.trial import trial_scene
 
-SCOUTING_LAW = "scouting@1"
-SCOUTING_NAMES = ("scouting", SCOUTING_LAW)
 SCOUTED = ("maize", "sugar_beet", "wheat_a")
 USUAL_INTEREST = (0.02, 0.10)  # share of the scene in patches, least and greatest
 RAGGED = 0.08  # noise that patches follow, over the side of the scene
@@ -43,29 +50,17 @@ DENSE = 350.0  # weeds of a patch per 1000 px
 EVEN = 0.4  # vigour's sd over the farm's
 POOR = 4.2  # by how much vigour is less in poor growth
 LODGED = 0.5  # of a field in the end, at the middle of a patch's edge
-BUILT_IN_NAMES = (*farm.FARM_NAMES, *SCOUTING_NAMES, *TRIAL_NAMES)
-LAWS = {
-    name: law
-    for names, law in ((farm.FARM_NAMES, farm.FARM_LAW), (SCOUTING_NAMES, SCOUTING_LAW), (TRIAL_NAMES, TRIAL_LAW))
-    for name in names
-}
 
 
 def built_in_scene(name: str, seed: int, *args: Any, **moment: Any) -> RasterScene:
     """Draw the built-in scene of a name; arguments and errors are those of the function of its law."""
-    make = {farm.FARM_LAW: farm.farm_scene, SCOUTING_LAW: scouting_scene, TRIAL_LAW: trial_scene}[LAWS[name]]
+    make = {FARM_LAW: farm.farm_scene, SCOUTING_LAW: scouting_scene, TRIAL_LAW: trial_scene}[LAWS[name]]
     return make(seed, *args, **moment)
-
-
-def built_in_laws(names: str) -> tuple[str, ...]:
-    """Return laws of built-in scenes named with commas; none where one of them is not built in."""
-    parts = [part.strip() for part in names.split(",")]
-    return tuple(dict.fromkeys(LAWS[part] for part in parts)) if all(part in LAWS for part in parts) else ()
 
 
 def scouting_scene(
     seed: int,
-    shape: tuple[int, int] = farm.FARM_SHAPE,
+    shape: tuple[int, int] = FARM_SHAPE,
     bands: int = 270,
     camera: LineCamera | None = None,
     *,
@@ -81,7 +76,7 @@ def scouting_scene(
     """
     if interest is not None and not 0 <= interest <= 1:
         raise SceneError(f"the share of interest is from 0 to 1, got {interest:g}")
-    day, hour = farm.USUAL_DAY if day is None else day, farm.USUAL_HOUR if hour is None else hour
+    day, hour = USUAL_DAY if day is None else day, USUAL_HOUR if hour is None else hour
     plan = scouting_plan(seed, shape, day=day, hour=hour)
     more = "" if interest is None else f"/interest={interest:g}"
     return farm.planned_scene(
@@ -89,7 +84,7 @@ def scouting_scene(
     )
 
 
-def scouting_plan(seed: int, shape: tuple[int, int] = farm.FARM_SHAPE, *, day: int, hour: float) -> FarmPlan:
+def scouting_plan(seed: int, shape: tuple[int, int] = FARM_SHAPE, *, day: int, hour: float) -> FarmPlan:
     """Plan the field; raises what `farm_plan` does."""
     whole = land_of(seed, shape)
     rng = land.stream(seed, "scouted field")

@@ -24,10 +24,9 @@ from spectralzoom.pipeline.simulator.scenes.farm import land
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, Painting, land_of, plan_field
 from spectralzoom.pipeline.simulator.scenes.farm.fields import paint_fields, plant_weeds
 from spectralzoom.pipeline.simulator.scenes.farm.land import Parcel
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_SHAPE, TRIAL_LAW, USUAL_DAY, USUAL_HOUR
 from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene
 
-TRIAL_LAW = "trial@1"
-TRIAL_NAMES = ("trial", TRIAL_LAW)
 ROUND_ABOUT = ("grass", "stubble")
 CROPS = ("maize", "sugar_beet", "wheat_a", "wheat_b")
 TRIAL_SIDE = 1 / 4  # of the scene's height and width
@@ -40,7 +39,7 @@ WEEDS_AROUND = 0.05
 
 def trial_scene(
     seed: int,
-    shape: tuple[int, int] = farm.FARM_SHAPE,
+    shape: tuple[int, int] = FARM_SHAPE,
     bands: int = 270,
     camera: LineCamera | None = None,
     *,
@@ -48,12 +47,12 @@ def trial_scene(
     hour: float | None = None,
 ) -> RasterScene:
     """Return a field trial on a day; arguments, errors and what equal arguments give are those of `farm_scene`."""
-    day, hour = farm.USUAL_DAY if day is None else day, farm.USUAL_HOUR if hour is None else hour
+    day, hour = USUAL_DAY if day is None else day, USUAL_HOUR if hour is None else hour
     plan = trial_plan(seed, shape, day=day, hour=hour)
     return farm.planned_scene("trial", TRIAL_LAW, plan, bands, camera or LineCamera(), lambda: _draw(plan))
 
 
-def trial_plan(seed: int, shape: tuple[int, int] = farm.FARM_SHAPE, *, day: int, hour: float) -> FarmPlan:
+def trial_plan(seed: int, shape: tuple[int, int] = FARM_SHAPE, *, day: int, hour: float) -> FarmPlan:
     """Plan the trial and the land about it; raises what `farm_plan` does."""
     whole = land_of(seed, shape)
     rng = land.stream(seed, "trial")

@@ -17,11 +17,11 @@ from PIL import Image
 from rich.console import Console
 
 from spectralzoom.flows.archive.export_command import run_export
+from spectralzoom.flows.opening.recorded_field import open_recorded
+from spectralzoom.flows.opening.visit import at_due_time
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.recorded_field import open_recorded
-from spectralzoom.flows.tasks.visit import at_due_time
 from spectralzoom.storage.readers.open_cubes import open_cube
 from tests.conftest import QUIET
 from tests.storage.readers.test_envi_cubes import write_envi

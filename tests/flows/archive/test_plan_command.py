@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from spectralzoom.flows.archive.plan_command import plan_content, scan_table, show_plan
-from spectralzoom.flows.field import open_field
+from spectralzoom.flows.opening.open_field import open_field
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.figures import format_seconds

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 import spectralzoom
 from spectralzoom.flows.archive.export_command import run_export
 from spectralzoom.flows.archive.export_layers import ProductFlags
+from spectralzoom.flows.planning.patch_budget import ReadingCosts
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.patch_budget import ReadingCosts
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid

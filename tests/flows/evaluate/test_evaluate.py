@@ -17,11 +17,11 @@ from spectralzoom.flows.evaluate.command import evaluate_weights, print_evaluati
 from spectralzoom.flows.evaluate.frames import observe_frame, open_candidates
 from spectralzoom.flows.evaluate.judge import ALL, NONE, Choice, Row, judge_frame, summarise
 from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
-from spectralzoom.flows.tasks.scene import pack_mask
 from spectralzoom.flows.training.data import farm_test_data
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.evaluation.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
+from spectralzoom.models.evaluation.taught_labels import pack_mask
 from spectralzoom.models.weights.files import load_weights, save_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.camera import LineCamera

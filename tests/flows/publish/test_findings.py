@@ -27,7 +27,7 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import NoPlace
 from spectralzoom.storage.arrays.class_maps import ClassMap, ClassNames
 from tests.conftest import CLASSES, Survey
-from tests.flows.tasks.test_unlike_training import FAR, SEEN
+from tests.flows.surveys.test_unlike_training import FAR, SEEN
 
 PLACE = NoPlace((2, 4), pixel_m=10.0)  # a pixel is a hundredth of a hectare
 GROUND: dict[str, Any] = {"crs": "EPSG:32632", "resolution_m": 0.12}

@@ -35,8 +35,8 @@ from spectralzoom.models.weights.files import MAP_SCORES, TRAINED_ON, _add_part,
 from spectralzoom.storage.store import Archive
 from tests.conftest import CLASSES, QUIET, Flags, WeightsMaker
 from tests.flows.publish.test_receipt import make_receipt
-from tests.flows.tasks.test_uniform_scan import RECORD
-from tests.flows.tasks.test_unlike_training import SEEN, with_spectra
+from tests.flows.surveys.test_uniform_scan import RECORD
+from tests.flows.surveys.test_unlike_training import SEEN, with_spectra
 from tests.prior_work import without_effects
 
 SCORES = MapScores((1, 2), (6.0, 100.0), np.zeros((2, 2, len(CLASSES))), np.full((2, 2), 0.01), 4)
@@ -178,7 +178,7 @@ def test_the_quicklook_has_the_warnings(
 @pytest.mark.parametrize("found", ["outside", 7, [3, {}], {"a": 1}, None])
 def test_other_things_in_the_place_of_warnings_are_none(found: Any) -> None:
     """A receipt of a stranger ends no command."""
-    from spectralzoom.flows.tasks.scores import warnings_of
+    from spectralzoom.flows.publish.scores import warnings_of
 
     assert warnings_of({"warnings": found}) == []
 

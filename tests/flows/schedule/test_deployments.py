@@ -22,8 +22,8 @@ import yaml
 
 from spectralzoom.flows.cli.main import STOPPING
 from spectralzoom.flows.cli.serve_command import _prepare, load_fields, schedule_of, survey_deployment
-from spectralzoom.flows.tasks import rig_field
-from spectralzoom.flows.tasks.rig_field import RIG_LIMIT, RigHold
+from spectralzoom.flows.opening import rig_field
+from spectralzoom.flows.opening.rig_field import RIG_LIMIT, RigHold
 from spectralzoom.storage.runs import read_run
 from spectralzoom.storage.store import Archive
 from tests.flows.conftest import server_for_all

@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from spectralzoom.flows.tasks.local_server import ServerUnavailable, copy_tables, local_server, private_files
+from spectralzoom.flows.local_server import ServerUnavailable, copy_tables, local_server, private_files
 
 FOREIGN = "http://evil.example"
 
@@ -60,7 +60,7 @@ def test_failed_migrations_leave_no_database(
 ) -> None:
     """The server is then unavailable, and the next survey tries again; a user may have no cache folder."""
     folder = None if cache is None else tmp_path / cache
-    monkeypatch.setattr("spectralzoom.flows.tasks.local_server.cache_folder", lambda: folder)
+    monkeypatch.setattr("spectralzoom.flows.local_server.cache_folder", lambda: folder)
     monkeypatch.setattr("sys.executable", shutil.which("false"))
     with pytest.raises(ServerUnavailable, match="cannot use its folder"), local_server(tmp_path / "home"):
         pass

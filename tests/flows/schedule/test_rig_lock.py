@@ -10,14 +10,14 @@ from unittest.mock import Mock
 
 import pytest
 
-from spectralzoom.flows.tasks import rig_field
-from spectralzoom.flows.tasks.rig_field import RigHold, rig_to_oneself
+from spectralzoom.flows.opening import rig_field
+from spectralzoom.flows.opening.rig_field import RigHold, rig_to_oneself
 from spectralzoom.pipeline.errors import RigError
 
 PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine use two rigs
 HOLDS = """
 import sys
-from spectralzoom.flows.tasks.rig_field import rig_to_oneself
+from spectralzoom.flows.opening.rig_field import rig_to_oneself
 with rig_to_oneself(sys.argv[1]):
     print(flush=True)
     sys.stdin.read()

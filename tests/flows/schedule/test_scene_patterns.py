@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from spectralzoom.flows.cli.serve_command import load_fields
+from spectralzoom.flows.opening.scene import scene_of_visit
 from spectralzoom.flows.settings.settings import Settings, load_settings
-from spectralzoom.flows.tasks.scene import scene_of_visit
 from spectralzoom.pipeline.errors import NoSceneYet, SettingsError
 
 JUNE = datetime(2026, 6, 1, 12, tzinfo=UTC)

@@ -16,7 +16,7 @@ from unittest.mock import Mock
 import pytest
 
 from spectralzoom.flows.cli.serve_command import load_fields, schedule_of, survey_deployment
-from spectralzoom.flows.tasks.observer import say_state
+from spectralzoom.flows.observer import say_state
 from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from spectralzoom.flows.evaluate.command import evaluate_weights
+from spectralzoom.flows.opening.survey_model import shipped_weights
 from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
-from spectralzoom.flows.tasks.field_work import WeightsFile
-from spectralzoom.flows.tasks.survey_model import shipped_weights
+from spectralzoom.flows.stages.field_work import WeightsFile
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.weights.files import describe_weights

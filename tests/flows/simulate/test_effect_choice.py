@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from spectralzoom.flows.cli.simulate_command import open_simulation, scan
-from spectralzoom.flows.field import make_source
+from spectralzoom.flows.opening.open_field import make_source
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages import effects as effect_choice

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from spectralzoom.flows.cli.simulate_command import open_simulation
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.opening.scene import open_scene
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import load_settings
-from spectralzoom.flows.tasks.scene import open_scene
 from spectralzoom.pipeline.errors import SettingsError
 
 SMALL: dict[str, Any] = {"scene": "scouting", "size": "96x64", "bands": "20,80,140,200", "engine": "plain"}

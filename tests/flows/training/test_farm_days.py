@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from spectralzoom.flows.archive.reprocess_command import asked_again, newest_runs
+from spectralzoom.flows.opening.scene import farm_refusal, open_scene
 from spectralzoom.flows.settings.settings import Settings, parse_settings
-from spectralzoom.flows.tasks.scene import farm_refusal, open_scene
 from spectralzoom.flows.training.data import farm_days, farm_test_data, open_training_data, read_farm_name
 from spectralzoom.flows.training.train_scenes import TrainRequest, observe_all
 from spectralzoom.models.network.spectral import SpectralBasis
@@ -19,8 +19,8 @@ from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_LAW
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.storage.runs import Catalogue
 from spectralzoom.storage.store import Archive
@@ -132,7 +132,7 @@ def test_training_scenes_have_the_effects_of_the_rig(bands: tuple[int, ...]) -> 
 def test_a_farm_larger_than_the_memory_is_refused(size: str, measured: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine with the measured bytes of a survey is too small; 10 % more suffice."""
     for there, refused in ((measured, True), (1.1 * measured, False)):
-        monkeypatch.setattr("spectralzoom.flows.tasks.scene.machine_bytes", lambda there=there: int(there))
+        monkeypatch.setattr("spectralzoom.flows.opening.scene.machine_bytes", lambda there=there: int(there))
         assert (farm_refusal(_settings(size=size)) is not None) == refused
 
 

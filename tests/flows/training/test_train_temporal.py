@@ -13,8 +13,8 @@ import torch
 
 import spectralzoom.flows.training.train_temporal as remember
 from spectralzoom.flows.cli.model_verbs import run_training
+from spectralzoom.flows.opening.survey_model import shipped_weights
 from spectralzoom.flows.settings.model_flags import TrainFlags
-from spectralzoom.flows.tasks.survey_model import shipped_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.flows.training.train_temporal import _moments, run_remember, train_temporal
 from spectralzoom.models.evaluation.metrics import confusion, mean_iou

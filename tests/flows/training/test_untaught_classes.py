@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spectralzoom.flows.evaluate.command import evaluate_weights
-from spectralzoom.flows.field import open_field
+from spectralzoom.flows.opening.open_field import open_field
 from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.training.train import train_weights

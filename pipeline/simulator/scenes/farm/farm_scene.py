@@ -41,14 +41,9 @@ from spectralzoom.pipeline.simulator.scenes.farm.spectra import (
     band_centres,
     spectral_library,
 )
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_LAW, FARM_PIXEL_M, FARM_SHAPE, USUAL_DAY, USUAL_HOUR
 from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, SceneRaster, scratch
 
-# A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
-FARM_LAW = "farm@2"
-FARM_NAMES = ("farm", FARM_LAW)
-FARM_SHAPE = (1024, 1280)  # (y, x) unless another is asked for [px]
-FARM_PIXEL_M = 0.12  # of the ground that a pixel shows
-USUAL_DAY, USUAL_HOUR = 172, 11.0  # the 21st of June, an hour before noon
 WIDTHS = {"margin": (2.0, 4.5), "hedge": (4.5, 6.5), "ditch": (1.3, 2.2), "road": (3.0, 5.0)}  # half, px
 BANKS = {"margin": (0.0, 0.0), "hedge": (0.0, 0.0), "ditch": (2.5, 4.5), "road": (1.0, 2.5)}
 BARE_CROWN = 0.62  # cover of a crown without leaves

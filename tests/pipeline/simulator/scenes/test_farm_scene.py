@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES, farm_plan
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from spectralzoom.pipeline.simulator.scenes.farm.spectra import MATERIALS
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_LAW
 
 SIZE, LONG, WIDE = (420, 520), (400, 1000), (720, 1000)
 

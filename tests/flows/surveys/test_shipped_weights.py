@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.opening.survey_model import shipped_weights, weights_path
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import load_settings
-from spectralzoom.flows.tasks.survey_model import shipped_weights, weights_path
 from spectralzoom.flows.tradeoff import coarse_of_sweeps
 from spectralzoom.models.evaluation.metrics import mean_iou
 from spectralzoom.models.policies.placement import ReadTwice
@@ -20,10 +20,9 @@ from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import frame_patches, full_sweeps
 from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance
 from spectralzoom.pipeline.simulator.rig_model import Rig
-from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_LAW
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
-from spectralzoom.pipeline.simulator.scenes.trial import TRIAL_LAW
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from spectralzoom.pipeline.simulator.scenes.laws import FARM_LAW, SCOUTING_LAW, TRIAL_LAW
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 PATH = shipped_weights()

@@ -18,7 +18,7 @@ from affine import Affine
 from PIL import Image
 from rich.console import Console
 
-import spectralzoom.flows.tasks.prior_maps as memory
+import spectralzoom.flows.opening.prior_maps as memory
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.models.network.sizes import TemporalSizes

@@ -12,9 +12,10 @@ import pytest
 import xarray as xr
 from rich.console import Console
 
+from spectralzoom.flows.archive.estimates import likely_changed
 from spectralzoom.flows.archive.plan_command import plan_content, show_plan
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.terminal.figures import format_count
 from spectralzoom.models.policies.placement import CascadeTable
@@ -141,5 +142,5 @@ def test_a_planned_second_pass_reads_again_what_its_time_shows(tmp_path: Path) -
     for budget in ("0.4", "0.5", "1"):
         asked = {"scene": "farm", "size": "640x512", "budget": budget, "zoom": "always", "out": str(tmp_path)}
         plan = plan_survey(open_field(load_settings(None, asked), planning=True))
-        again.append(len(plan.likely_changed))
+        again.append(len(likely_changed(plan)))
     assert 0 < again[0] < again[1] < again[2] == len(plan.field.grid.every_patch())

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.frame import Prior
+from spectralzoom.flows.planning.capture_plan import PassLayout
 from spectralzoom.flows.settings.values import format_extent
-from spectralzoom.flows.tasks.capture_plan import PassLayout
 from spectralzoom.flows.terminal.figures import format_percent
 from spectralzoom.models.reading.expected_errors import Floats, PatchExpectedErrors
 from spectralzoom.models.reading.prior_map import (

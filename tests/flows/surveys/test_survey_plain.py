@@ -16,12 +16,12 @@ import xarray as xr
 from PIL import Image
 from rich.console import Console
 
+from spectralzoom.flows.opening.scene import open_scene
 from spectralzoom.flows.publish.receipt import check_receipt
 from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.scene import open_scene
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.reading.inference import segment
 from spectralzoom.models.weights.files import load_weights, save_weights

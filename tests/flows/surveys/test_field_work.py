@@ -10,13 +10,14 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from spectralzoom.flows.field import open_field
 from spectralzoom.flows.frame import Prior
-from spectralzoom.flows.plan import SurveyPlan, plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.planning.patch_budget import SHARD
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import load_settings
-from spectralzoom.flows.tasks.drawing import Drawing, draw_field, prior_map_of
-from spectralzoom.flows.tasks.field_work import FieldWork, Scoring, WeightsFile, overview_file
-from spectralzoom.flows.tasks.patch_budget import SHARD
+from spectralzoom.flows.stages.drawing import Drawing, draw_field, prior_map_of
+from spectralzoom.flows.stages.field_work import FieldWork, Scoring, WeightsFile, overview_file
 from spectralzoom.models.network.sizes import CELL_PX, TOKEN_PX
 from spectralzoom.models.reading.regions import plan_regions
 from spectralzoom.models.weights.files import describe_weights, load_weights, save_weights
@@ -59,14 +60,16 @@ def _mosaics(stages: Path) -> list[Ref]:
 
 
 def _work(plan: SurveyPlan, pool: WorkerPool, halo: int) -> FieldWork:
-    return replace(plan.work, regions=plan_regions(plan.field.grid, SHARD, most_px=MOST_PX, halo=halo), pool=pool)
+    return replace(
+        plan.reading.gains.work, regions=plan_regions(plan.field.grid, SHARD, most_px=MOST_PX, halo=halo), pool=pool
+    )
 
 
 def _draw(
     work: FieldWork, plan: SurveyPlan, stages: Path, out: Path, least_gain: float | None = None
 ) -> dict[str, bytes]:
     """Return the bytes of the map that this work writes into a new folder."""
-    legend = ClassNames(plan.field.weights.class_names, plan.field.weights.class_colours)
+    legend = ClassNames(plan.field.model.load().class_names, plan.field.model.load().class_colours)
     out.mkdir()
     create_class_map(out / MAP, plan.field.scene.shape, legend, grid=plan.field.frame.angular_grid())
     create_probabilities(out / PROBABILITIES, plan.field.scene.shape, legend, grid=plan.field.frame.angular_grid())
@@ -88,7 +91,7 @@ def test_regions_with_a_full_halo_give_the_same_map(surveyed: Surveyed, tmp_path
     stored = _contents(_store(stages, "segment").path / MAP)
     assert len(_work(plan, pool, ALL_PX).regions) == 2
     assert _draw(_work(plan, pool, ALL_PX), plan, stages, tmp_path / "m") == stored
-    assert _draw(plan.work, plan, stages, tmp_path / "one") == stored
+    assert _draw(plan.reading.gains.work, plan, stages, tmp_path / "one") == stored
 
 
 @pytest.mark.parametrize(("overviews", "stored"), [(16, True), (16, False), (1, True)])
@@ -97,13 +100,13 @@ def test_regions_choose_patches_by_the_classes_of_the_field(
 ) -> None:
     """With a halo over the whole field they choose as one region does."""
     plan, stages = surveyed
-    gain = plan.work.score("gain", _mosaics(stages)[1], plan.capture, lambda done: None)
+    gain = plan.reading.gains.work.score("gain", _mosaics(stages)[1], plan.capture, lambda done: None)
     least = float(np.quantile(gain, 0.7)) + 1e-9
-    monkeypatch.setattr("spectralzoom.flows.tasks.drawing.MOST_OVERVIEWS", overviews)
+    monkeypatch.setattr("spectralzoom.flows.stages.drawing.MOST_OVERVIEWS", overviews)
     if not stored:  # an overview that was not kept is computed again
-        monkeypatch.setattr("spectralzoom.flows.tasks.drawing.load_overview", lambda path, weights: None)
+        monkeypatch.setattr("spectralzoom.flows.stages.drawing.load_overview", lambda path, weights: None)
     regions = _draw(_work(plan, WorkerPool(workers=2), ALL_PX), plan, stages, tmp_path / "m", least)
-    whole = _draw(plan.work, plan, stages, tmp_path / "one", least)
+    whole = _draw(plan.reading.gains.work, plan, stages, tmp_path / "one", least)
     assert (regions == whole) == (overviews == 16)  # one of two regions has other classes
     assert regions != _contents(_store(stages, "segment").path / MAP)
 
@@ -118,7 +121,7 @@ def test_scores_of_regions_equal_those_of_the_field(
     """The halo covers the field, or one patch, which edges need; the stage's own scores are the same for its policy."""
     plan, stages = surveyed
     mosaic = _mosaics(stages)[0]
-    whole = plan.work.score(policy, mosaic, plan.capture, lambda done: None)
+    whole = plan.reading.gains.work.score(policy, mosaic, plan.capture, lambda done: None)
     parts = _work(plan, WorkerPool(workers=2), halo_px).score(policy, mosaic, plan.capture, lambda done: None)
     np.testing.assert_allclose(parts, whole, rtol=within)  # gains are sums over the field
     if policy == plan.settings.policy:
@@ -129,11 +132,13 @@ def test_pickled_work_contains_its_weights(surveyed: Surveyed, tmp_path: Path) -
     """A worker uses the weights that were sent, whatever file is at their path."""
     plan, stages = surveyed
     copy = tmp_path / "w.safetensors"
-    copy.write_bytes(plan.work.weights.path.read_bytes())
-    scoring = Scoring(replace(plan.work.weights, path=copy), _mosaics(stages)[0], plan.capture, policy="entropy")
-    sent = pickle.dumps((scoring, plan.work.regions[0]))
+    copy.write_bytes(plan.reading.gains.work.weights.path.read_bytes())
+    scoring = Scoring(
+        replace(plan.reading.gains.work.weights, path=copy), _mosaics(stages)[0], plan.capture, policy="entropy"
+    )
+    sent = pickle.dumps((scoring, plan.reading.gains.work.regions[0]))
     assert len(sent) < copy.stat().st_size + 2000
-    expected = scoring(plan.work.regions[0])
+    expected = scoring(plan.reading.gains.work.regions[0])
     copy.write_bytes(b"other weights")
     travelled, region = pickle.loads(sent)
     assert (travelled(region) == expected).all()
@@ -191,14 +196,14 @@ def test_keys_contain_regions_for_divided_fields_only(size: tuple[int, int]) -> 
 def test_a_prior_map_has_no_seams_between_regions(surveyed: Surveyed) -> None:
     """Features come from outside of a region's halo, as far as the field has them."""
     plan, stages = surveyed
-    classes = tuple(range(len(plan.field.weights.class_names)))
+    classes = tuple(range(len(plan.field.model.load().class_names)))
     before = Prior("a run", _store(stages, "segment"), _mosaics(stages)[0], 1.0, None, classes)
     (field,) = plan_regions(plan.field.grid, SHARD)
-    whole = prior_map_of(before, field, plan.field.weights).coarse
+    whole = prior_map_of(before, field, plan.field.model.load()).coarse
     assert whole is not None
     for region in plan_regions(plan.field.grid, SHARD, most_px=MOST_PX, halo=16):
         here = region.read.over(CELL_PX)
-        found = prior_map_of(before, region, plan.field.weights).coarse
+        found = prior_map_of(before, region, plan.field.model.load()).coarse
         np.testing.assert_array_equal(found, whole[here.rows, here.columns])
 
 

@@ -15,7 +15,7 @@ from spectralzoom.flows.settings.values import BUILT_IN_SCENES, PART
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX, shift_px
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from spectralzoom.pipeline.simulator.scenes.laws import USUAL_DAY, USUAL_HOUR
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore

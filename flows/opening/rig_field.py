@@ -11,10 +11,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from spectralzoom.flows.local_server import server_answers
+from spectralzoom.flows.observer import current_observer
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import inside_flow
-from spectralzoom.flows.tasks.local_server import server_answers
-from spectralzoom.flows.tasks.observer import current_observer
 from spectralzoom.pipeline.errors import RigError
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT
 from spectralzoom.pipeline.geometry.scan import Sweep, exposing, sweep_positions

@@ -1,6 +1,7 @@
 """Draw a field's map region by region: the current visit, fused with the prior map of the field.
 
-As in `flows.tasks.field_work` a worker gets references to stores, and returns arrays. The survey's process writes them.
+As in `flows.stages.field_work`, a worker gets references to stores and returns arrays, which the survey's process
+writes.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.frame import Prior
-from spectralzoom.flows.tasks.field_work import (
+from spectralzoom.flows.stages.field_work import (
     GAIN,
     FieldWork,
     Scoring,

@@ -6,11 +6,11 @@ from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from spectralzoom.flows.opening.scene import scene_of_visit
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES
 from spectralzoom.flows.stage import inside_flow
-from spectralzoom.flows.tasks.scene import scene_of_visit
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from spectralzoom.pipeline.simulator.scenes.laws import USUAL_DAY, USUAL_HOUR
 from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.runs import Run

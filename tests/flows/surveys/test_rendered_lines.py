@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from spectralzoom.flows.field import make_source
+from spectralzoom.flows.opening.open_field import make_source
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.stages.capture import take_lines
 from spectralzoom.pipeline.errors import RigError, SceneError

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import zarr
 
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.opening.rig_field import rig_to_oneself
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.rig_field import rig_to_oneself
 from spectralzoom.pipeline.errors import PoseError, RigError, SettingsError
 from spectralzoom.pipeline.rig.fakes import FakeCamera
 from spectralzoom.pipeline.rig.transports import DeviceGone

@@ -17,10 +17,10 @@ from rich.console import Console
 
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
 from spectralzoom.flows.plan import SurveyPlan
-from spectralzoom.flows.tasks import extent_choice
-from spectralzoom.flows.tasks.drawing import Drawing
-from spectralzoom.flows.tasks.extent_choice import ExtentGains
-from spectralzoom.flows.tasks.patch_budget import SHARD
+from spectralzoom.flows.planning import extent_choice
+from spectralzoom.flows.planning.extent_choice import ExtentGains
+from spectralzoom.flows.planning.patch_budget import SHARD
+from spectralzoom.flows.stages.drawing import Drawing
 from spectralzoom.models.network.sizes import MultiplyAdds, TemporalSizes
 from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.reading.expected_errors import PatchExpectedErrors

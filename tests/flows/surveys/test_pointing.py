@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spectralzoom.flows.planning.capture_plan import PassLayout
 from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.settings.settings import load_settings, parse_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.capture_plan import PassLayout
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
 from spectralzoom.pipeline.geometry.scan import Sweep

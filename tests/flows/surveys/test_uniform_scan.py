@@ -13,8 +13,9 @@ from PIL import Image
 
 from spectralzoom.flows.archive.plan_command import plan_content
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import SurveyPlan, plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey

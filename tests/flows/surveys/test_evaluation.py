@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spectralzoom.flows.publish.scores import format_false_classes, format_worst_class, score_of
 from spectralzoom.flows.stages import evaluate as evaluation
 from spectralzoom.flows.stages import register
-from spectralzoom.flows.tasks.scene import judged_labels
-from spectralzoom.flows.tasks.scores import format_false_classes, format_worst_class, score_of
 from spectralzoom.models.evaluation.metrics import confusion
+from spectralzoom.models.evaluation.taught_labels import judged_labels
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.rectify.registration.illumination import LightRatio

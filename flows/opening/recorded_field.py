@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from spectralzoom.flows.opening.scene import unlit_scene
+from spectralzoom.flows.opening.visit import time_of_visit
 from spectralzoom.flows.settings.load import merged, nested, unnested
 from spectralzoom.flows.settings.rules import OF_THE_PLAN, changed, completed
 from spectralzoom.flows.settings.settings import MOST_STEP, Settings, parse_settings
 from spectralzoom.flows.settings.values import ALWAYS, AUTO, BUILT_IN_SCENES, RECORDED
-from spectralzoom.flows.tasks.scene import unlit_scene
-from spectralzoom.flows.tasks.visit import time_of_visit
 from spectralzoom.pipeline.capture.recorded import Recording
 from spectralzoom.pipeline.capture.recorded_passes import sweeps_as_taken
 from spectralzoom.pipeline.capture.straight_scans import EDGE_PX, covered_field

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from spectralzoom.flows.opening.zones import place_of_field
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import Output
 from spectralzoom.flows.stages.ground import STORE, colours_of, ground
-from spectralzoom.flows.tasks.zones import place_of_field
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import PosedField
 from spectralzoom.pipeline.ground.map_grid import GroundGrid

@@ -16,10 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from spectralzoom.flows.opening.training_ranges import beyond_training, training_warning
 from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.survey_model import beyond_training, training_warning
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra

@@ -15,12 +15,13 @@ import pytest
 from pydantic import ValidationError
 
 from spectralzoom.flows import prefect_flow, survey_command
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import SurveyPlan, plan_survey
+from spectralzoom.flows.local_server import ServerUnavailable
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Request, Stores
 from spectralzoom.flows.survey import run_stages
-from spectralzoom.flows.tasks.local_server import ServerUnavailable
 from spectralzoom.storage.store import Archive, Ref
 from tests.exported_run import POSE
 from tests.flows.conftest import act_instead, newest_run, stages

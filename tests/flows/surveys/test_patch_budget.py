@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from spectralzoom.flows.archive.plan_command import plan_content
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import plan_survey
+from spectralzoom.flows.opening.open_field import open_field
+from spectralzoom.flows.planning.patch_budget import PatchBudget, ReadingCosts
+from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import load_settings, parse_settings
-from spectralzoom.flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from spectralzoom.models.network.sizes import SegmenterConfig, multiply_adds
 from spectralzoom.models.policies.policies import score_multiply_adds
 from spectralzoom.pipeline.errors import BudgetError, SettingsError

@@ -1,1 +1,0 @@
-"""Parts of a survey below its stages: scenes, sources, zones, prior maps, choice of lines and patches, network."""
