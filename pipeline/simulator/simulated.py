@@ -35,7 +35,8 @@ from spectralzoom.pipeline.source import AT_REST, Line, References
 Raw = NDArray[np.uint16]
 REFERENCE_FRAMES = 32  # of whole numbers, of which a dark or white frame is the mean
 BLOCK_LINES = 16  # rendered at a time: 11 MB of light with 640 samples and 270 bands
-TIMED_BLOCKS, TIMED_LINES = 3, 4  # spread evenly over the lines of all sweeps, and lines of each
+TIMED_BLOCKS, TIMED_LINES = 3, 4  # at most, spread evenly over the lines of all sweeps, and lines of each
+LINES_A_BLOCK = 512  # of a capture, for each timed block: the tables of a block take as long as hundreds of lines
 Frame = NDArray[np.float32]
 SEEN = frozenset({RESPONSE, SMILE, PRNU, STRIPING})  # by light of the white reference
 
@@ -139,9 +140,9 @@ class SimulatedSource:
         """
         spent: dict[bool, float] = {True: 0.0, False: 0.0}
         numbers = [(sweep, line) for sweep in sweeps for line in range(sweep.lines)]
-        timed = 0
-        for block in range(TIMED_BLOCKS if numbers and dict(self.chosen) != dict(exact) else 0):
-            sweep, line = numbers[(2 * block + 1) * len(numbers) // (2 * TIMED_BLOCKS)]
+        timed, blocks = 0, min(TIMED_BLOCKS, 1 + len(numbers) // LINES_A_BLOCK)
+        for block in range(blocks if numbers and dict(self.chosen) != dict(exact) else 0):
+            sweep, line = numbers[(2 * block + 1) * len(numbers) // (2 * blocks)]
             lines = range(line, sweep.lines)[:TIMED_LINES]
             for every, source in ((True, replace(self, chosen=exact)), (False, self)):
                 source.render(sweep, lines[:1])  # makes the tables of the sweep
