@@ -44,9 +44,6 @@ class Field:
     camera: LineCamera  # of the settings, or of the recording
     light: LineSpec  # line spacing and light of a full scan in the camera's exposure
     source: Source | None  # None of a raster, which needs no capture
-    view: FieldView | None  # what the camera sees; None of a raster
-    recorded: Recording | None  # the source where it is a recording
-    simulates: bool  # a scene, so that effects are chosen for it
     simulated: SimulatedSource  # without effects; for a rig, a model of its sizes, paths and memory
     raster: RasterPixels | None  # of a scene that needs no capture
     hold: RigHold  # keeps other surveys from the rig
@@ -57,3 +54,25 @@ class Field:
     notes: tuple[str, ...]
     warnings: tuple[str, ...]  # about the map, before it is drawn
     refused: str | None  # why this machine cannot run a survey that is only planned
+
+    @property
+    def recorded(self) -> Recording | None:
+        """Return the source of lines where it is a recording."""
+        return self.source if isinstance(self.source, Recording) else None
+
+    @property
+    def simulates(self) -> bool:
+        """Return whether a scene is simulated, so that effects are chosen for it."""
+        return self.source is not None and bool(self.source.effects)
+
+    @property
+    def view(self) -> FieldView:
+        """Return what the camera sees. A raster has no camera."""
+        assert self.source is not None
+        return view_of(self.settings, self.scene, self.source)
+
+
+def view_of(settings: Settings, scene: RasterScene, source: Source) -> FieldView:
+    """Return what the camera sees of a scene, or of the field before the source."""
+    light = {"source": source.name, "scene": scene.key, "visit": settings.visit, **source.key}
+    return FieldView(settings.camera, scene.wavelength_nm, scene.fwhm_nm, light)

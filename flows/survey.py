@@ -177,7 +177,6 @@ def _first_pass(stores: Stores, plan: SurveyPlan, effects: Ref | None) -> Pass:
     """Capture the first pass, or the uniform scan, and rectify it."""
     field, settings = plan.field, plan.settings
     assert field.source is not None
-    assert field.view is not None
     raw = capture_coarse(
         stores,
         effects,
@@ -220,7 +219,6 @@ def _second_pass(
     field, settings = plan.field, plan.settings
     sweeps = [] if request is None else request.sweeps
     assert field.source is not None
-    assert field.view is not None
     raw = capture_fine(
         stores,
         attention if request is not None else replace(attention, key=""),  # which leaves the lines open

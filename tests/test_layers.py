@@ -7,6 +7,7 @@ import importlib
 import re
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -17,6 +18,8 @@ MAY_IMPORT = {
     "flows": {"flows", "models", "storage", "pipeline"},
     "spectralzoom": {"spectralzoom", "flows", "models", "storage", "pipeline"},
 }
+MOST_OF_A_STAGE = 70  # modules, with packages
+MOST_OF_THE_FLOW = 0.62  # of the modules
 NOT_OURS = {"", "tests", *MAY_IMPORT} - {"spectralzoom"}  # relative, of tests, or of the user's own folders
 OWNERS = {
     **dict.fromkeys(("prefect", "cyclopts", "matplotlib"), ("flows/",)),
@@ -50,6 +53,45 @@ def room_of(name: str) -> str:
 def test_settings_read_no_archive_and_no_file_of_a_scene() -> None:
     """They import nothing of `storage`: what an archive knows is a layer of defaults that its caller gives."""
     assert [one for one in imports() if one[0].startswith("flows/settings/") and room_of(one[1]) == "storage"] == []
+
+
+@cache
+def loads(module: str) -> frozenset[str]:
+    """Return the modules of the product that a module's own code loads, without those in functions or for types."""
+    path = ROOT.joinpath(*module.split(".")[1:]) if module.partition(".")[2] else ROOT / "spectralzoom"
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    body = ast.parse(file.read_text(encoding="utf-8")).body if file.is_file() else []
+    froms = [(node.module or "", one.name) for node in body if isinstance(node, ast.ImportFrom) for one in node.names]
+    names = [name for module, one in froms for name in (module, f"{module}.{one}")]
+    names += [one.name for node in body if isinstance(node, ast.Import) for one in node.names]
+    return frozenset(name for name in names if name.startswith("spectralzoom.") and is_module(name))
+
+
+def is_module(name: str) -> bool:
+    """Return whether a name is that of a module or package of the product."""
+    path = ROOT.joinpath(*name.split(".")[1:])
+    return path.is_dir() or path.with_suffix(".py").is_file()
+
+
+def closure(module: str) -> set[str]:
+    """Return all modules that a module loads, and their packages."""
+    found: set[str] = set()
+    left = [module]
+    while left:
+        name = left.pop()
+        if name not in found:
+            found.add(name)
+            left += [*loads(name), *([name.rpartition(".")[0]] if "." in name else [])]
+    return found
+
+
+def test_a_stage_and_the_flow_load_a_part_of_the_product() -> None:
+    """A stage loads what it needs alone, and the order of stages is apart from what opens files."""
+    stages = [f"spectralzoom.flows.stages.{path.stem}" for path in (ROOT / "flows" / "stages").glob("[a-z]*.py")]
+    many = {name: len(closure(name)) for name in stages if len(closure(name)) > MOST_OF_A_STAGE}
+    assert (len(stages) > 10, many) == (True, {})
+    files = sum(1 for room in MAY_IMPORT if room != "spectralzoom" for _ in (ROOT / room).rglob("*.py"))
+    assert 100 < len(closure("spectralzoom.flows.survey")) <= MOST_OF_THE_FLOW * files
 
 
 def test_imports_go_one_way_and_packages_are_declared() -> None:

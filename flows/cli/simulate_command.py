@@ -10,8 +10,9 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.markup import escape
 
+from spectralzoom.flows.field import view_of
 from spectralzoom.flows.observer import tidy_up
-from spectralzoom.flows.opening.open_field import make_source, view_of
+from spectralzoom.flows.opening.open_field import make_source
 from spectralzoom.flows.opening.scene import darkness, farm_refusal, open_scene
 from spectralzoom.flows.planning.capture_plan import PassLayout
 from spectralzoom.flows.planning.plan_survey import pool_of

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from spectralzoom.flows.field import Field
-from spectralzoom.flows.frame import FieldFrame, FieldLabels, FieldView
+from spectralzoom.flows.frame import FieldFrame, FieldLabels
 from spectralzoom.flows.observer import current_observer
 from spectralzoom.flows.opening.prior_maps import AUTO, NONE, find_prior
 from spectralzoom.flows.opening.recorded_field import open_recorded, recorded_scene
@@ -63,11 +63,9 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     if settings.source == RECORDED:
         settings, recording = open_recorded(settings)
     settings = settings.but(device=choose_device(settings.device))
-    model = (
-        SurveyModel.unread()
-        if settings.ends_unread
-        else SurveyModel.open(weights_path(settings), settings.device, planning=planning)
-    )
+    model = SurveyModel.unread()
+    if not settings.ends_unread:
+        model = SurveyModel.open(weights_path(settings), settings.device, planning=planning)
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
@@ -76,23 +74,16 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     place = place_of_field(settings, scene)
     zones = open_zones(settings, place, grid)
     raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
-    outside = beyond_training(settings, scene, model.described, model.trained_on) if model.reads else []
-    if raster is not None:
-        outside += other_unit(raster, scene.wavelength_nm, model.load()) if model.reads else []
-        if not planning:
-            raster.rows_at_once(settings.memory)  # raises an error where one row of patches does not fit
+    if raster is not None and not planning:
+        raster.rows_at_once(settings.memory)  # raises an error where one row of patches does not fit
     archive = Archive(Path(settings.out).absolute())
     name = settings.name or Path(scene.name).stem
     label_notes = check_labels(scene, model.described) if model.reads else ()
-    stated, known = moment_of(settings.visit), moment_of(scene.acquired)
-    if stated is not None and known is not None and stated.date() != known.date():
-        notes += (f"--visit {settings.visit} is kept, though the file says that it was acquired {scene.acquired}",)
     prior, prior_notes = find_prior(archive, settings, name, grid, model.described.class_names, scene)
     if settings.prior != AUTO:  # a receipt names the run
         settings = settings.but(prior=NONE if prior is None else prior.run)
     simulated = make_source(scene, settings)
     hold = RigHold(settings.rig.port if settings.on_hardware else None, current_observer().note)
-    source = open_source(settings, name, simulated, recording, hold)
     camera, fractions = settings.camera, zones.fractions
     return Field(
         settings=settings,
@@ -108,10 +99,7 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
         kept_patches=grid.every_patch() if fractions is None else np.flatnonzero(fractions > 0),
         camera=camera,
         light=LineSpec(camera.exposure_ms * scene.light_fraction / DEFAULT_EXPOSURE_MS),
-        source=source,
-        view=None if source is None else view_of(settings, scene, source),
-        recorded=recording,
-        simulates=source is not None and bool(source.effects),
+        source=open_source(settings, name, simulated, recording, hold),
         simulated=simulated,
         raster=raster,
         hold=hold,
@@ -122,10 +110,29 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
             scene.key if settings.scene in BUILT_IN_SCENES and recording is None else None,
         ),
         prior=prior,
-        notes=(*notes, *zones.notes, *prior_notes, *label_notes),
-        warnings=(*darkness(settings), *training_warning(outside, model.path)),
+        notes=(*notes, *_other_day(settings, scene), *zones.notes, *prior_notes, *label_notes),
+        warnings=(*darkness(settings), *_beyond_training(settings, scene, model, raster)),
         refused=refused,
     )
+
+
+def _beyond_training(
+    settings: Settings, scene: RasterScene, model: SurveyModel, raster: RasterPixels | None
+) -> tuple[str, ...]:
+    """Return the warning about what lies outside of the training of the weights, if something does."""
+    if not model.reads:
+        return ()
+    outside = beyond_training(settings, scene, model.described, model.trained_on)
+    outside += [] if raster is None else other_unit(raster, scene.wavelength_nm, model.load())
+    return training_warning(outside, model.path)
+
+
+def _other_day(settings: Settings, scene: RasterScene) -> tuple[str, ...]:
+    """Return a note where visit and file state different days."""
+    stated, known = moment_of(settings.visit), moment_of(scene.acquired)
+    if stated is None or known is None or stated.date() == known.date():
+        return ()
+    return (f"--visit {settings.visit} is kept, though the file says that it was acquired {scene.acquired}",)
 
 
 def _scene_for(
@@ -168,12 +175,6 @@ def open_source(
     if settings.source == RIG:
         return rig_source(settings, name, simulated, hold)
     return simulated if recording is None else recording
-
-
-def view_of(settings: Settings, scene: RasterScene, source: Source) -> FieldView:
-    """Return what the camera sees of a scene, or of the field before the source."""
-    light = {"source": source.name, "scene": scene.key, "visit": settings.visit, **source.key}
-    return FieldView(settings.camera, scene.wavelength_nm, scene.fwhm_nm, light)
 
 
 def noise_seed(settings: Settings) -> int:
