@@ -127,9 +127,6 @@ def _reading(
     work = FieldWork(file, opened.regions, pool_of(settings), settings.memory)
     mask = None if settings.mask is None else load_labels_array(settings.mask)
     cascade = _cascade(opened, settings)
-    compared = grid.height * grid.width
-    if extent is not None:  # its lines were chosen by the prior map
-        compared += -(-grid.height // EVERY_PX) * -(-grid.width // EVERY_PX)
     return ReadingPlan(
         gains=PatchGains(opened.frame, zones, work, capture, settings.policy, settings.seed, mask),
         costs=costs,
@@ -142,8 +139,14 @@ def _reading(
         cascade=cascade,
         least_gain=_least_gain(cascade, settings, with_prior=opened.prior is not None),
         reader=None if opened.prior is None else described.reader,
-        compared_px=compared,
+        compared_px=compared_px(grid, chosen=extent is not None),
     )
+
+
+def compared_px(grid: SceneGrid, *, chosen: bool) -> int:
+    """Return the pixels of a prior map that its reader compares: for the map, and where it has ``chosen`` the lines."""
+    choice = -(-grid.height // EVERY_PX) * -(-grid.width // EVERY_PX)
+    return grid.height * grid.width + chosen * choice
 
 
 def _cascade(opened: Field, settings: Settings) -> CascadeTable | None:

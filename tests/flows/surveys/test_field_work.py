@@ -149,7 +149,7 @@ def test_pickled_work_contains_its_weights(surveyed: Surveyed, tmp_path: Path) -
 )
 def test_too_little_memory_is_refused(surveyed: Surveyed, tmp_path: Path, pool: WorkerPool, words: str) -> None:
     """The message gives the memory of a region and the minimum, and that minimum suffices."""
-    work = replace(surveyed[0].work, pool=pool, memory=300 * 2**20)
+    work = replace(surveyed[0].reading.gains.work, pool=pool, memory=300 * 2**20)
     with pytest.raises(SettingsError, match=rf"exceeds --memory 300 MiB: .*96 x 128 px.*{words}") as refused:
         work.pool_for(np.arange(192), 3)
     least = int(str(refused.value).split("--memory")[-1].split()[0])
@@ -158,7 +158,7 @@ def test_too_little_memory_is_refused(surveyed: Surveyed, tmp_path: Path, pool: 
 
 def test_simultaneous_regions_fit_into_the_memory(surveyed: Surveyed) -> None:
     """A worker pool shrinks to fit, and keeps its size if all of it fits."""
-    work = replace(surveyed[0].work, pool=WorkerPool(workers=7))
+    work = replace(surveyed[0].reading.gains.work, pool=WorkerPool(workers=7))
     assert work.pool_for(np.arange(9), 3) is work.pool
     pools = [replace(work, memory=size * 2**20).pool_for(np.arange(9), 3).workers for size in (516, 520, 600)]
     assert pools == sorted(pools, key=int)

@@ -16,10 +16,11 @@ import xarray as xr
 from rich.console import Console
 
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
-from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.plan import ReadingPlan
 from spectralzoom.flows.planning import extent_choice
 from spectralzoom.flows.planning.extent_choice import ExtentGains
 from spectralzoom.flows.planning.patch_budget import SHARD
+from spectralzoom.flows.planning.plan_survey import compared_px
 from spectralzoom.flows.stages.drawing import Drawing
 from spectralzoom.models.network.sizes import MultiplyAdds, TemporalSizes
 from spectralzoom.models.network.temporal_reader import TemporalReader
@@ -249,9 +250,8 @@ def test_the_reader_counts_for_the_choice_of_lines_and_for_the_map() -> None:
     """The choice reads a quarter of the prior map's pixels."""
     reader = SimpleNamespace(sizes=TemporalSizes(2, 4))
     costs = SimpleNamespace(of_map=lambda index: MultiplyAdds(5, 0, 7))
-    field = SimpleNamespace(reader=reader, grid=SceneGrid(95, 63, 4))
     map_px, choice_px = 95 * 63, 48 * 32
-    for extent, pixels in ((None, map_px), ("chosen", map_px + choice_px)):
-        plan: Any = SimpleNamespace(costs=costs, field=field, least_gain=None, chooses=False, extent=extent)
-        done = SurveyPlan.work_done(plan, np.arange(3)).detail
-        assert done == 7 + reader.sizes.multiply_adds(pixels)
+    for chosen, pixels in ((False, map_px), (True, map_px + choice_px)):
+        compared = compared_px(SceneGrid(95, 63, 4), chosen=chosen)
+        plan: Any = SimpleNamespace(costs=costs, reader=reader, least_gain=None, chooses=False, compared_px=compared)
+        assert ReadingPlan.work_done(plan, np.arange(3)).detail == 7 + reader.sizes.multiply_adds(pixels)

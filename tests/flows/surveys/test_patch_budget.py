@@ -170,8 +170,8 @@ def test_a_zoomed_survey_reads_the_overview_twice(tmp_path: Path) -> None:
     flags = {"scene": "farm", "size": "320x256", "seconds": "12", "out": str(tmp_path)}
     both = (load_settings(None, {**flags, "zoom": zoom}) for zoom in ("never", "always"))
     never, always = (plan_survey(open_field(one, planning=True)) for one in both)
-    assert always.least_gain is not None
-    assert always.work_done(np.arange(5)).overview == 2 * never.work_done(np.arange(5)).overview
+    assert always.reading.least_gain is not None
+    assert always.reading.work_done(np.arange(5)).overview == 2 * never.reading.work_done(np.arange(5)).overview
 
 
 @pytest.mark.parametrize(("policy", "again"), [("gain", True), ("entropy", True), ("sobel", False)])
