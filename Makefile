@@ -56,7 +56,7 @@ test: $(BIN)/.ok-dev $(BIN)/.ok
 
 lint: $(BIN)/.ok-dev
 	$(BIN)/ruff check .
-	$(BIN)/ruff check --select D --ignore D105 --config 'lint.pydocstyle.convention="numpy"' spectralzoom
+	$(BIN)/ruff check --select D --ignore D105 --config 'lint.pydocstyle.convention="numpy"' src
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 

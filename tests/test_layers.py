@@ -11,21 +11,22 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "spectralzoom"
 MAY_IMPORT = {
     "pipeline": {"pipeline"},
     "models": {"models", "pipeline"},
     "storage": {"storage", "pipeline"},
     "flows": {"flows", "models", "storage", "pipeline"},
-    "spectralzoom": {"spectralzoom", "flows", "models", "storage", "pipeline"},
+    "src": {"src", "flows", "models", "storage", "pipeline"},
 }
 MOST_OF_A_STAGE = 70  # modules, with packages
 MOST_OF_THE_FLOW = 0.62  # of the modules
-NOT_OURS = {"", "tests", *MAY_IMPORT} - {"spectralzoom"}  # relative, of tests, or of the user's own folders
+NOT_OURS = {"", "tests", *MAY_IMPORT}  # relative, of tests, or of the user's own folders
 OWNERS = {
     **dict.fromkeys(("prefect", "cyclopts", "matplotlib"), ("flows/",)),
     **dict.fromkeys(("zarr", "obstore"), ("storage/",)),
     **{"serial": ("pipeline/rig/",), "numba": ("pipeline/",), "torch": ("models/", "pipeline/rectify/")},
-    **{"dask": ("storage/", "flows/"), "xarray": ("storage/", "spectralzoom/"), "rich": ("flows/", "spectralzoom/")},
+    **{"dask": ("storage/", "flows/"), "xarray": ("storage/", "src/"), "rich": ("flows/", "src/")},
 }
 DISTRIBUTIONS = {
     **{"PIL": "pillow", "sklearn": "scikit-learn", "serial": "pyserial", "skimage": "scikit-image"},
@@ -45,9 +46,8 @@ def imports() -> list[tuple[str, str]]:
 
 
 def room_of(name: str) -> str:
-    """Return the folder of a module of the product by its import name, else the package."""
-    parts = name.split(".")
-    return parts[1] if parts[0] == "spectralzoom" and len(parts) > 1 and parts[1] in MAY_IMPORT else parts[0]
+    """Return the folder of a module of the product by its import name."""
+    return next((part for part in name.split(".")[1:2] if part in MAY_IMPORT), "src")
 
 
 def test_settings_read_no_archive_and_no_file_of_a_scene() -> None:
@@ -58,7 +58,7 @@ def test_settings_read_no_archive_and_no_file_of_a_scene() -> None:
 @cache
 def loads(module: str) -> frozenset[str]:
     """Return the modules of the product that a module's own code loads, without those in functions or for types."""
-    path = ROOT.joinpath(*module.split(".")[1:]) if module.partition(".")[2] else ROOT / "spectralzoom"
+    path = PACKAGE.joinpath(*module.split(".")[1:])
     file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     body = ast.parse(file.read_text(encoding="utf-8")).body if file.is_file() else []
     froms = [(node.module or "", one.name) for node in body if isinstance(node, ast.ImportFrom) for one in node.names]
@@ -69,7 +69,7 @@ def loads(module: str) -> frozenset[str]:
 
 def is_module(name: str) -> bool:
     """Return whether a name is that of a module or package of the product."""
-    path = ROOT.joinpath(*name.split(".")[1:])
+    path = PACKAGE.joinpath(*name.split(".")[1:])
     return path.is_dir() or path.with_suffix(".py").is_file()
 
 
@@ -90,12 +90,12 @@ def test_a_stage_and_the_flow_load_a_part_of_the_product() -> None:
     stages = [f"spectralzoom.flows.stages.{path.stem}" for path in (ROOT / "flows" / "stages").glob("[a-z]*.py")]
     many = {name: len(closure(name)) for name in stages if len(closure(name)) > MOST_OF_A_STAGE}
     assert (len(stages) > 10, many) == (True, {})
-    files = sum(1 for room in MAY_IMPORT if room != "spectralzoom" for _ in (ROOT / room).rglob("*.py"))
+    files = sum(1 for room in MAY_IMPORT if room != "src" for _ in (ROOT / room).rglob("*.py"))
     assert 100 < len(closure("spectralzoom.flows.survey")) <= MOST_OF_THE_FLOW * files
 
 
 def test_imports_go_one_way_and_packages_are_declared() -> None:
-    """The order is spectralzoom, flows, models and storage, pipeline; no import is relative or of tests."""
+    """The order is src, flows, models and storage, pipeline; no import is relative or of tests."""
     found = [(file, name, name.split(".")[0]) for file, name in imports()]
     assert [one for one in found if one[2] in NOT_OURS] == []
     ours = [(file, room_of(name)) for file, name, top in found if top == "spectralzoom"]
@@ -107,5 +107,5 @@ def test_imports_go_one_way_and_packages_are_declared() -> None:
     outside = {top for *_, top in found} - {"spectralzoom", *sys.stdlib_module_names}
     assert {DISTRIBUTIONS.get(name, name) for name in outside} <= declared
     for room in MAY_IMPORT:  # packages of the same name from elsewhere are not tested
-        name = room if room == "spectralzoom" else f"spectralzoom.{room}"
-        assert Path(str(importlib.import_module(name).__file__)).resolve() == ROOT / room / "__init__.py"
+        name, folder = ("spectralzoom", PACKAGE) if room == "src" else (f"spectralzoom.{room}", ROOT / room)
+        assert Path(str(importlib.import_module(name).__file__)).resolve() == folder / "__init__.py"

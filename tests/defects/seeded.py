@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 
+from tests.source_paths import python_path
+
 ROOT = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_name("defects.toml")
 PACKAGES = ("spectralzoom", *(f"spectralzoom.{name}" for name in ("flows", "models", "pipeline", "storage")))
@@ -80,13 +82,13 @@ class TreeCopy:
         copy = cls(root)
         code = "import importlib, sys\nfor name in sys.argv[1:]: print(importlib.import_module(name).__file__)"
         places = copy.python("-c", code, *PACKAGES).stdout.split()
-        if [Path(place).resolve().parents[1] for place in places] != [root.resolve()] * len(PACKAGES):
+        if not all(Path(place).resolve().is_relative_to(root.resolve()) for place in places):
             raise RuntimeError(f"Python imports {places}, expected the copy {root}")
         return copy
 
     def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """Run Python in the copy; a run that does not end in time has the code 124."""
-        known = dict(os.environ) | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(self.root)}
+        known = dict(os.environ) | {"OMP_NUM_THREADS": "1", "PYTHONPATH": python_path(self.root)}
         command = [sys.executable, *arguments]
         try:
             return subprocess.run(

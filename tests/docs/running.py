@@ -30,6 +30,7 @@ from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.storage.readers.scene_toml import load_scene_settings
 from tests.docs.pages import ROOT, Block
 from tests.flows.conftest import FEW_BANDS
+from tests.source_paths import python_path
 
 SHOWN = ("text",)  # program output and pictures of letters: nothing to run
 BUILT = ("{toctree}", "{eval-rst}")  # run by `make docs`
@@ -78,7 +79,7 @@ class Reader:
         """Return a copy of the folders that a page may add to."""
         root = self.folder / "tree"
         if not root.exists():
-            for name in ("pipeline", "models", "storage", "flows", "spectralzoom", "tests"):
+            for name in ("pipeline", "models", "storage", "flows", "src", "tests"):
                 # with bytecode, valid for files of the same dates
                 shutil.copytree(ROOT / name, root / name, symlinks=True)
             shutil.copy(ROOT / "pyproject.toml", root)
@@ -111,7 +112,7 @@ class Reader:
     def _elsewhere(self, block: Block, flags: str) -> None:
         """Run the commands with the copy of the folders, in a separate process; pytest runs in the copy."""
         (program, *first), *others = map(shlex.split, commands_of(block))
-        environment = {**os.environ, "PYTHONPATH": str(self.tree)}
+        environment = {**os.environ, "PYTHONPATH": python_path(self.tree)}
         words = [[*first, *shlex.split(flags)], *(one[1:] for one in others)]
         tests = program == "pytest"
         command = [sys.executable, *(["-m", "pytest", *first] if tests else ["-c", EACH, json.dumps(words)])]

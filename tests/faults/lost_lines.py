@@ -25,6 +25,7 @@ from spectralzoom.pipeline.source import Line
 from spectralzoom.storage.arrays.spool import SYNC_LINES, Spool
 from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.nursery import ROOT
+from tests.source_paths import PYTHON_PATH
 
 SAMPLES, BANDS = 20, 7
 LINES = 5 * SYNC_LINES + 13
@@ -168,7 +169,7 @@ def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
     chance = random.Random(seed)
     found = Losses()
     command = [sys.executable, "-c", WRITER]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": PYTHON_PATH}
     for number in range(kills):
         place = folder / f"killed-{number}"
         with subprocess.Popen([*command, str(place)], cwd=ROOT, env=environment, stdout=subprocess.PIPE) as process:

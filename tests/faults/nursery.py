@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.source_paths import PYTHON_PATH
+
 ROOT = Path(__file__).resolve().parents[2]
 ADVICE = ("run again", "--out", "another folder", "free space", "ulimit")
 
@@ -87,7 +89,7 @@ class Nursery:
         self.folder = folder
         self._number = 0
         command = [sys.executable, "-m", "tests.faults.nursery", str(folder / "choices")]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        environment = {**os.environ, "PYTHONPATH": PYTHON_PATH, "OMP_NUM_THREADS": "1"}
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, cwd=ROOT, env=environment, stdin=pipe, stdout=pipe, text=True)
 

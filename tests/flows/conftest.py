@@ -27,6 +27,7 @@ from spectralzoom.storage.store import Archive
 from tests.conftest import Flags, Survey
 from tests.flows.small_fields import write_field
 from tests.prior_work import without_effects
+from tests.source_paths import PYTHON_PATH
 
 CommandLine = Callable[..., "Ended"]
 FEW_BANDS = ",".join(map(str, range(4, 270, 9)))  # of the farm: the fewest that give all the shipped weights' columns
@@ -148,7 +149,7 @@ def turned(scene: Path, to: Path) -> Path:
 
 def python(code: str, *words: object, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run code of this project in another process and return the result."""
-    known = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), **environment}
+    known = {**os.environ, "PYTHONPATH": PYTHON_PATH, **environment}
     command = [sys.executable, "-c", code, *map(str, words)]
     return subprocess.run(command, env=known, capture_output=True, text=True, check=False)
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from spectralzoom.pipeline.compiled import DOUBLES, compiled
+from tests.source_paths import PYTHON_PATH
 
 ROOT = Path(__file__).parents[2]
 LOOP = """
@@ -90,7 +91,7 @@ def test_loops_run_without_a_cache() -> None:
 def test_two_processes_may_compile_at_once(file: Path) -> None:
     """Two processes finish without errors in one empty cache folder, and leave it intact."""
     command = [sys.executable, "-c", ASK, str(file.parent)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": PYTHON_PATH}
     both = [subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     assert [one.communicate()[1] for one in both] == ["", ""]
     assert doubled(opened(file)) == [0, 2, 4]

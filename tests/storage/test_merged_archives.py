@@ -15,6 +15,7 @@ import spectralzoom
 from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.storage.runs import Catalogue, clear_up, read_run, verify_everything
 from spectralzoom.storage.store import Archive, Ref, check_store, digest_of
+from tests.source_paths import PYTHON_PATH
 from tests.storage.small_archive import Small, make_store, problems, publish_receipt, small_survey
 
 
@@ -163,7 +164,7 @@ def test_a_store_made_again_by_another_process_is_never_refused(tmp_path: Path) 
     """One clears and makes the inputs of a run, the other opens the run, its map and the stores."""
     archive = Archive.open(tmp_path)
     small = small_survey(archive)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = {**os.environ, "PYTHONPATH": PYTHON_PATH}
     command = [sys.executable, "-c", CLEARS, str(tmp_path)]
     looks = 0
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as other:

@@ -40,6 +40,7 @@ from spectralzoom.storage.store import (
     uri_of,
 )
 from spectralzoom.storage.whole_files import PART, locked
+from tests.source_paths import PYTHON_PATH
 from tests.storage.small_archive import flip, make_store, problems, rewrite, small_survey
 
 ROOT = Path(__file__).parents[2]
@@ -585,7 +586,7 @@ def test_an_archive_verifies_after_a_kill_at_any_system_call(archive: Archive, t
     """A store is cleared and made again, and a run is published: it is whole or absent, and the next survey ends."""
     small_survey(Archive.open(tmp_path / "archive"), named=False)
     command = [sys.executable, "-c", KILL_EVERYWHERE, str(tmp_path / "archive"), str(tmp_path)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": PYTHON_PATH}
     calls = int(subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True).stdout)
     assert calls > 30
     seen = set()

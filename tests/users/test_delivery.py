@@ -24,7 +24,8 @@ from spectralzoom.flows.settings.flags import KEYS
 from tests.conftest import WeightsMaker
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("spectralzoom", "flows", "models", "storage", "pipeline")
+FOLDERS = ("flows", "models", "storage", "pipeline")  # of the product, which a project may have too
+PACKAGES = ("src", *FOLDERS)
 BESIDE = ("pyproject.toml", "README.md", "LICENSE")
 AS_NOBODY = ("setpriv", "--reuid=12345", "--regid=12345", "--clear-groups")  # a user without a name or a home
 BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
@@ -60,7 +61,7 @@ def may_be_nobody(python: Path) -> bool:
 
 def own_packages(project: Path) -> None:
     """Make a project whose packages have the names of the product's folders, and cannot be imported."""
-    for name in PACKAGES[1:]:
+    for name in FOLDERS:
         (project / name).mkdir()
         (project / name / "__init__.py").write_text(f"raise ImportError('{name} of the project was imported')\n")
 
@@ -113,9 +114,9 @@ def test_the_wheel_contains_exactly_the_files_of_the_packages(tree: Path, wheel:
         found = {name: packed.read(name) for name in packed.namelist() if ".dist-info/" not in name}
     known = {}
     for name in PACKAGES:
-        below = "spectralzoom" if name == "spectralzoom" else f"spectralzoom/{name}"
         for path in (path for path in (tree / name).rglob("*") if path.is_file() and "egg-info" not in str(path)):
-            known[f"{below}/{path.relative_to(tree / name).as_posix()}"] = path.read_bytes()
+            file = path.relative_to(tree / "src" if name == "src" else tree).as_posix()
+            known[file if name == "src" else f"spectralzoom/{file}"] = path.read_bytes()
     assert set(found) == set(known)
     assert [name for name in known if found[name] != known[name]] == []
 
@@ -151,6 +152,26 @@ from prefect.flows import load_flow_from_entrypoint
 from spectralzoom.flows.prefect_flow import survey
 print(load_flow_from_entrypoint(survey.to_deployment("north").entrypoint).name)
 """
+
+
+def test_the_editable_path_holds_the_package_alone(tmp_path: Path) -> None:
+    """No folder of the checkout can be imported by its own name."""
+    code = "import importlib.util as u, sys; print([name for name in sys.argv[1:] if u.find_spec(name)])"
+    assert (
+        run([sys.executable, "-c", code, "spectralzoom", *FOLDERS, "tests", "docs"], tmp_path, {})
+        == "['spectralzoom']\n"
+    )
+
+
+def test_links_that_git_wrote_as_text_are_named(tmp_path: Path) -> None:
+    """As on Windows, where git makes no links by default: the import says what to do."""
+    shutil.copytree(ROOT / "src", tmp_path / "src", symlinks=True)
+    for name in FOLDERS:
+        (tmp_path / "src" / "spectralzoom" / name).unlink()
+        (tmp_path / "src" / "spectralzoom" / name).write_text(f"../../{name}")
+    words = [sys.executable, "-c", "import spectralzoom"]
+    ended = subprocess.run(words, cwd=tmp_path / "src", capture_output=True, text=True, check=False)
+    assert ended.stderr.splitlines()[-1].startswith("ImportError: git wrote links of this checkout as text")
 
 
 @pytest.mark.parametrize("kind", ["wheel", "editable"])

@@ -27,6 +27,7 @@ from spectralzoom.flows.opening.rig_field import RIG_LIMIT, RigHold
 from spectralzoom.storage.runs import read_run
 from spectralzoom.storage.store import Archive
 from tests.flows.conftest import server_for_all
+from tests.source_paths import PYTHON_PATH
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 300.0
@@ -229,7 +230,7 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
 
     names = ("stopped", "paused")  # of no other test: a run of an earlier serve would be cancelled
     files = [field_file(name, source="raster", budget=None) for name in names]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
+    environment = {**os.environ, "PYTHONPATH": PYTHON_PATH, "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
     words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "spectralzoom.flows.cli.main"]
     words += ["serve", *map(str, files), "--every", "365d"]
     with (

@@ -13,6 +13,7 @@ import pytest
 from spectralzoom.flows.opening import rig_field
 from spectralzoom.flows.opening.rig_field import RigHold, rig_to_oneself
 from spectralzoom.pipeline.errors import RigError
+from tests.source_paths import PYTHON_PATH
 
 PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine use two rigs
 HOLDS = """
@@ -32,7 +33,7 @@ def assert_held(port: str) -> None:
 
 def test_a_killed_holder_frees_the_rig(tmp_path: Path) -> None:
     """Until then it holds it also for processes with another TMPDIR and HOME."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    environment = {**os.environ, "PYTHONPATH": PYTHON_PATH}
     environment |= {"TMPDIR": str(tmp_path), "HOME": str(tmp_path)}
     command = [sys.executable, "-c", HOLDS, PORT]
     with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:

@@ -27,6 +27,7 @@ from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked
 from tests.flows.conftest import problems, server_for_all
 from tests.flows.schedule.test_deployments import PATIENCE_S, ROOT, planned, run_here
+from tests.source_paths import PYTHON_PATH
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -98,7 +99,7 @@ def test_days_of_visits(field_file: Callable[..., Path], prefect_home: Path, tmp
 @contextmanager
 def serving(file: Path, port: int, **environment: str) -> Iterator[subprocess.Popen[str]]:
     """Run `serve` for a field in another process for the block, with a runner that asks every second."""
-    known = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1", **environment}
+    known = {**os.environ, "PYTHONPATH": PYTHON_PATH, "PREFECT_RUNNER_POLL_FREQUENCY": "1", **environment}
     words = [sys.executable, "-m", "spectralzoom.flows.cli.main", "serve", file, "--every", "365d", "--port", port]
     with subprocess.Popen(list(map(str, words)), cwd=ROOT, env=known, stderr=subprocess.PIPE, text=True) as process:
         try:

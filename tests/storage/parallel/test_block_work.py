@@ -27,6 +27,7 @@ from spectralzoom.storage.parallel import pool as pool_module
 from spectralzoom.storage.parallel.pool import WorkerPool, run_blocks
 from spectralzoom.storage.remote.worker_stores import FetchingWork
 from spectralzoom.storage.store import Archive, Ref, digest_of
+from tests.source_paths import PYTHON_PATH
 from tests.storage.small_archive import make_store
 
 ROOT = Path(__file__).parents[3]
@@ -369,7 +370,7 @@ def run_script(folder: Path, text: str, *words: str) -> subprocess.Popen[str]:
     """Start a program in a process and a session of its own."""
     (script := folder / "script.py").write_text(text)
     command = [sys.executable, str(script), *words]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": PYTHON_PATH}
     said = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, env=environment, start_new_session=True, **said)  # type: ignore[call-overload, no-any-return]
 

@@ -17,6 +17,7 @@ from spectralzoom.pipeline.simulator.optics.rays import RayViews
 from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler, _Mixing
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.pipeline.simulator.small_scenes import made_scene
+from tests.source_paths import PYTHON_PATH
 
 ROOT = Path(__file__).parents[4]
 SHAPE = (23, 37)
@@ -116,7 +117,7 @@ numpy.save(sys.argv[1], far_and_near())
 def test_loops_stay_within_their_arrays(tmp_path: Path) -> None:
     """Without compilation Python checks every index: the loops end, and give the compiled results."""
     command = [sys.executable, "-c", CHECKED, str(tmp_path / "light.npy")]
-    python = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_DISABLE_JIT": "1"}
+    python = {**os.environ, "PYTHONPATH": PYTHON_PATH, "NUMBA_DISABLE_JIT": "1"}
     subprocess.run(command, env=python, cwd=ROOT, check=True)
     np.testing.assert_allclose(np.load(tmp_path / "light.npy"), far_and_near(), rtol=1e-5)
 

@@ -6,7 +6,14 @@ The import is light: functions load their modules when they are called.
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+if Path(__file__).with_name("pipeline").is_file():
+    raise ImportError(
+        "git wrote links of this checkout as text; allow links (on Windows the developer mode), then run: "
+        "git config core.symlinks true, and git checkout -- src"
+    )
 
 from spectralzoom.pipeline.errors import PipelineError as Error
 
