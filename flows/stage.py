@@ -7,6 +7,9 @@
 
 In a flow each call is a Prefect task of the stage's name; elsewhere it is a plain call. Arguments that change no byte
 are annotated `Unkeyed`. The stores of a dry run make nothing: they answer with the addresses that stores would have.
+
+A stage that cannot serve every field says so by ``lacks``, a function of the same keywords. It returns why, or an empty
+text. The stage is then left out with that reason, in plan and receipt, and so are stages that take its store.
 """
 
 from __future__ import annotations
@@ -55,6 +58,7 @@ class Stage(Generic[P]):
     product: str  # folder of its stores; two stages may share one
     retries: int  # by Prefect, after an OSError
     made_by: tuple[str, ...]  # folders and files whose code determines its bytes
+    lacks: Callable[..., str] = lambda **facts: ""  # returns why these arguments allow no store
 
     @property
     def name(self) -> str:
@@ -72,15 +76,21 @@ class Stage(Generic[P]):
         params = {
             name: one for name, one in call.kwargs.items() if _NOT_IN_THE_KEY not in get_args(hints.get(name))[1:]
         }
-        request = Request(self, inputs, params, lambda out: self.build(out, *args, **facts))
+        request = Request(self, inputs, params, lambda out: self.build(out, *args, **facts), self.lacks(**call.kwargs))
         return task_in_flow(self.name, stores.name, partial(stores.get, request), *inputs, retries=self.retries)
 
 
 def stage(
-    title: str, *, version: int, product: str | None = None, retries: int = 0, made_by: Sequence[str] = ()
+    title: str,
+    *,
+    version: int,
+    product: str | None = None,
+    retries: int = 0,
+    made_by: Sequence[str] = (),
+    lacks: Callable[..., str] = lambda **facts: "",
 ) -> Callable[[Callable[Concatenate[Output, P], None]], Stage[P]]:
     """Return a decorator that makes a function a `Stage`."""
-    return lambda build: Stage(build, title, version, product or build.__name__, retries, tuple(made_by))
+    return lambda build: Stage(build, title, version, product or build.__name__, retries, tuple(made_by), lacks)
 
 
 def inside_flow() -> bool:
@@ -130,6 +140,7 @@ class Request:
     inputs: Sequence[Ref]
     params: Mapping[str, Any]
     build: Callable[[Output], None]
+    lack: str = ""  # why there can be no store
 
 
 @dataclass(frozen=True)
@@ -139,8 +150,8 @@ class Row:
     name: str
     title: str
     ref: Ref  # in a dry run without a key where that depends on the content of a store that is missing
-    state: Literal["ran", "cached", "to run", "blocked"]
-    why: str = ""  # a stage is blocked
+    state: Literal["ran", "cached", "to run", "blocked", "left out"]
+    why: str = ""  # a stage is blocked or left out
     version: int = 0
     params: Mapping[str, Any] = field(default_factory=dict)
     wall_s: float | None = None
@@ -175,11 +186,12 @@ class Stores:
         self.bytes_written = 0
         self._watch, self._log, self._note, self._finish = watch, log, note, finish
         self._cleared: dict[Ref, Callable[[], object]] = {}  # makes each again
+        self._left_out: dict[Ref, str] = {}  # with titles of the stages
 
     @property
     def refs(self) -> list[Ref]:
-        """Return the stores of all stages."""
-        return [row.ref for row in self.rows.values()]
+        """Return the stores of all stages that have one."""
+        return [row.ref for row in self.rows.values() if row.state != "left out"]
 
     def total(self, fact: str) -> float:
         """Return the sum of a fact of the stages that ran."""
@@ -190,8 +202,14 @@ class Stores:
         return bool(ref.key) and self.archive.is_there(ref.uri)
 
     def get(self, request: Request, *_: Ref) -> Ref:
-        """Return the store of a request, found or made. In a dry run its address; without a key where that is open."""
+        """Return the store of a request, found or made. In a dry run its address; without a key where that is open.
+
+        A stage that is left out has an address without a key too.
+        """
         made = request.stage
+        without = [self._left_out[ref] for ref in request.inputs if ref in self._left_out]
+        if request.lack or without:
+            return self._leave_out(made, request.lack or f"it needs what is left out: {without[0]}")
         if not all(ref.key for ref in request.inputs):
             return self._make(request, Ref(made.product, "", Path()))
         key = stage_key(made.product, made.version, request.params, request.inputs)
@@ -206,6 +224,13 @@ class Stores:
             self._cleared[ref] = partial(self._make, request, ref)
             found = True
         return self._record(self._row(request, ref)) if found else self._make(request, ref)
+
+    def _leave_out(self, made: Stage[Any], why: str) -> Ref:
+        """Record that a stage cannot serve this field."""
+        ref = Ref(f"no {made.name}", "", Path())
+        self._left_out[ref] = made.title
+        self._note(f"{made.title} is left out: {why}")
+        return self._record(Row(made.name, made.title, ref, "left out", why, made.version))
 
     def restore(self, ref: Ref) -> None:
         """Make a store again if its files were cleared away."""
@@ -268,6 +293,8 @@ class Stores:
             name = f"{row.name}-{number}"
         self.rows[name] = replace(row, name=name)
         self._watch(row.name, row.title, row.state, 1.0)
+        if row.state == "left out":
+            return row.ref
         took = "found" if row.wall_s is None else f"{row.wall_s:.1f} s"
         self._log(f"{row.title}: {took}, {(row.bytes_out or 0) / 1e6:.1f} MB, {row.ref.uri}")
         return row.ref

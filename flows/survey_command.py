@@ -143,7 +143,7 @@ def _publish_stored(settings: Settings) -> RunRef | None:
     if (refused := farm_refusal(settings)) is not None:
         raise SettingsError(refused)
     plan, stores = dry_run(settings)
-    if any(row.state != "cached" for row in stores.rows.values()) or "PREFECT_API_URL" in os.environ:
+    if any(row.state not in ("cached", "left out") for row in stores.rows.values()) or "PREFECT_API_URL" in os.environ:
         return None
     return carry_out(plan, started)
 

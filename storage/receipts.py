@@ -119,8 +119,9 @@ class StageRow(_Part):
     """One stage; figures of a store that was found are null."""
 
     name: Name
-    key: Name
-    state: Literal["ran", "cached"]
+    key: Name | None = None  # None of a stage that is left out
+    state: Literal["ran", "cached", "left out"]
+    why: str = ""  # it is left out
     wall_s: float | None = None
     cpu_s: float | None = None
     peak_rss_bytes: Count | None = None

@@ -38,7 +38,7 @@ from spectralzoom.pipeline.planning.uniform_scans import frontier
 from spectralzoom.storage.store import Archive, is_archive
 
 MOST_LETTERS = 250  # of a reason
-COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow"}
+COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "left out": "dim"}
 
 
 def plan(
@@ -103,7 +103,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "warnings": warnings,
         "archive": settings.out,
         "stages": rows,
-        "to_make": sum(row["state"] != "cached" for row in rows),
+        "to_make": sum(row["state"] not in ("cached", "left out") for row in rows),
         "refused": field.refused,  # why this machine would refuse the survey
         "notes": list(plan.notes),
         "scans": {

@@ -141,7 +141,7 @@ def _settings_of(
     settings = settings.but(prior=prior, **here)
     shown = _is_there(run, settings)
     rows = dry_run(settings)[1].rows if shown else {}
-    if shown and run.problem is None and all(row.state == "cached" for row in rows.values()):
+    if shown and run.problem is None and all(row.state in ("cached", "left out") for row in rows.values()):
         return None
     captures = [row for name, row in rows.items() if name in (capture_coarse.name, capture_fine.name)]
     gone = settings.source == RIG and any(row.state != "cached" for row in captures)  # that light is over

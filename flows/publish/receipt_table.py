@@ -159,12 +159,16 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     if not verbose:
         return
     stages = [
-        [escape(one["name"]), one["state"], format_seconds(one["wall_s"]), format_bytes(one["bytes_out"])]
+        [escape(one["name"]), _state(one), format_seconds(one["wall_s"]), format_bytes(one["bytes_out"])]
         for one in receipt["stages"]
     ]
     console.print(table(("stage", "state", "wall time", "written"), stages, left=2))
     if "effects_total" in receipt:
         print_effects(receipt["effects"], receipt["effects_total"], console)
+
+
+def _state(stage: Mapping[str, Any]) -> str:
+    return escape(f"left out: {stage['why']}") if stage["state"] == "left out" else str(stage["state"])
 
 
 def print_effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any], console: Console) -> None:

@@ -186,3 +186,31 @@ def test_an_oserror_is_retried_in_a_flow_alone(
         with pytest.raises(error, match="no reply"):
             call()
         assert len(tried) == expected
+
+
+def few_letters(text: str, **_: object) -> str:
+    """Return why a text cannot be served; empty where it can."""
+    return "it has no letter" if not text else ""
+
+
+@stage("initial", version=1, lacks=few_letters)
+def initial(out: Output, *, text: str, pool: Unkeyed[int] = 1) -> None:
+    """Write the first letter of a text."""
+    (out.path / "letter").write_text(text[0])
+
+
+@pytest.mark.parametrize("dry", [False, True])
+def test_a_stage_that_cannot_serve_is_left_out_with_what_needs_it(archive: Archive, dry: bool) -> None:
+    """Its reason is in its row and in a note; other stages go on."""
+    notes: list[str] = []
+    stores = Stores(archive, dry=dry, note=notes.append)
+    word = join(stores, letter(stores, text="a"), initial(stores, text=""))
+    alone = initial(Stores(archive, dry=dry), text="b")
+    made = "to run" if dry else "ran"
+    assert states(stores) == {"letter": made, "initial": "left out", "join": "left out"}
+    whys = ["it has no letter", "it needs what is left out: initial"]
+    assert [row.why for row in stores.rows.values() if row.state == "left out"] == whys
+    assert notes == [f"{title} is left out: {why}" for title, why in zip(("initial", "two letters"), whys, strict=True)]
+    assert [ref.stage for ref in stores.refs] == ["letter"]
+    assert not stores.has(word)
+    assert (alone.key != "", archive.is_there(alone.uri)) == (True, not dry)
