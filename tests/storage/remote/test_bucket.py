@@ -28,7 +28,7 @@ from spectralzoom.storage.remote.all_names import signed
 from spectralzoom.storage.remote.bucket import Copied, pull, push
 from spectralzoom.storage.remote.objects import Objects, UnreachableError
 from spectralzoom.storage.runs import clear_up, verify_everything
-from spectralzoom.storage.store import Archive, Ref, digest_of, is_cleared, manifest_text
+from spectralzoom.storage.store import Archive, Ref, digest_of, is_cleared, manifest_text, publish
 from tests.faulty_proxy import FAULTS, Choose, faulty_proxy
 from tests.storage.small_archive import make_store, publish_receipt, small_survey
 
@@ -292,6 +292,26 @@ def test_a_stopped_push_continues(
     assert {uri.split("/")[1] for uri in fetch(bucket, tmp_path / "there")[1].copied} == {"capture", "rectify"}
     assert len(send(archive, bucket).copied) == 2
     assert contents(fetch(bucket, tmp_path / "there")[0].root) == contents(archive.root)
+
+
+@pytest.mark.parametrize("is_cleared_there", [False, True])
+def test_other_content_of_a_store_is_named_without_a_run(bucket: str, tmp_path: Path, is_cleared_there: bool) -> None:
+    """A push tells of a store that the bucket has otherwise; the run that rests on it there can be pulled."""
+    first, other = (Archive.open(tmp_path / name) for name in ("first", "other"))
+    raw = small_survey(first, seed=4).raw
+    if is_cleared_there:
+        first.clear(raw)
+    send(first, bucket)
+    publish(other.root / raw.uri, lambda folder: (folder / "data.bin").write_text("another light") and {})
+    if is_cleared_there:
+        with pytest.raises(
+            IncompleteStoreError, match=f"^{raw.uri} cannot be .* digest is .{{12}} here and .{{12}} there"
+        ):
+            send(other, bucket)
+    else:
+        assert send(other, bucket).conflicts == [raw.uri]
+    assert len(fetch(bucket, tmp_path / "third")[0].runs()) == 1
+    assert problems(tmp_path / "third") == []
 
 
 def test_the_first_writer_of_a_store_wins(bucket: str, tmp_path: Path) -> None:
