@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import secrets
 from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,6 +26,7 @@ from spectralzoom.storage.store import (
     Archive,
     check_store,
     conflicts,
+    damage,
     digest_of,
     inputs_first,
     is_cleared,
@@ -199,9 +199,12 @@ def _send(folder: Path, uri: str, objects: Objects) -> tuple[int | None, bytes]:
     check_store(folder)
     kind, text = _manifest_name(folder), manifest_bytes(folder)
     files = parse_manifest(text)["files"] if kind == MANIFEST else {}
-    with suppress(FileNotFoundError):  # it is cleared meanwhile, or damaged
-        some_at_a_time(lambda name: objects.write(_address(uri, text, name), folder / name), files)
-    check_store(folder, every_byte=True)  # what was sent is what the manifest lists
+    try:
+        some_at_a_time(lambda name: objects.write(_address(uri, text, name), folder / name, files[name][1]), files)
+    except (FileNotFoundError, IncompleteStoreError) as error:  # it is cleared or made again meanwhile, or damaged
+        if kind == _manifest_name(folder) and text == manifest_bytes(folder):
+            raise damage(folder, f"a file of it has changed while it was sent ({error})") from error
+    check_store(folder)
     if kind != _manifest_name(folder) or text != manifest_bytes(folder):  # cleared, or made again
         return _send(folder, uri, objects)
     winner = objects.create(f"{uri}/{kind}", text)
