@@ -17,10 +17,12 @@ from pydantic import ValidationError
 from spectralzoom.flows import prefect_flow, survey_command
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
+from spectralzoom.flows.publish.publishing import RunRef
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Request, Stores
 from spectralzoom.flows.survey import run_stages
 from spectralzoom.flows.tasks.local_server import ServerUnavailable
+from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.storage.store import Archive, Ref
 from tests.exported_run import POSE
 from tests.flows.conftest import act_instead, newest_run, stages
@@ -244,3 +246,12 @@ def test_sigterm_in_a_stage(field_file: Any, server: str, monkeypatch: pytest.Mo
     assert ended.err.splitlines()[-1] == "terminated; run the same command to resume"
     assert command_line("survey", file).code == 0
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_the_note_on_a_lost_server_says_what_became_of_the_survey() -> None:
+    """A survey that was stopped before its map has stored stages and no run."""
+    notes: list[str] = []
+    whole = RunRef("runs/one", Path("x"))
+    for run in (whole, replace(whole, stopped=SurveyStopped("mosaic", "stages/rectify/k", "x"))):
+        assert survey_command.FlowWork(run).without_server(Settings(), OSError("timed out"), notes.append) is run
+    assert [note.rpartition(": ")[2] for note in notes] == ["the run is published", "its stages are stored"]

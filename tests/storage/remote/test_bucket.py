@@ -240,7 +240,7 @@ def test_a_file_that_differs_only_while_it_is_sent_is_not_published(
             aside.replace(source)
 
     monkeypatch.setattr(Objects, "write", changed)
-    with pytest.raises((ArchiveError, IncompleteStoreError), match="data.bin (has changed|is a link)"):
+    with pytest.raises((ArchiveError, IncompleteStoreError), match=r"data\.bin (has changed|is a link)"):
         send(archive, bucket)
     assert problems(archive.root) == []
     assert not [name for name in Objects(bucket).listing() if name.endswith("manifest.json")]
