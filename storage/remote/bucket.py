@@ -184,7 +184,7 @@ def _copy(
     runs = [uri for uri in copied if uri.startswith("runs/")]
     named = {one for uri in runs for one in try_manifest(archive.root / uri)[0][RESTS_ON]}
     both = [(uri, own) for uri in asked if uri not in copied and (own := digest_of(archive.root / uri))]
-    digests = some_at_a_time(lambda one: digest_there(one[0]), both)
+    digests = some_at_a_time(digest_there, [uri for uri, _ in both])
     others = [uri for (uri, own), other in zip(both, digests, strict=True) if other not in (None, own)]
     missing = sorted(uri for uri in named if not is_known(archive.root / uri))
     there = len(asked) - len(copied) - len(others)
