@@ -71,7 +71,9 @@ class FlowWork:
         """
         if self.error is not None:
             raise self.error
-        ends = "it continues with --engine plain" if self.run is None else "the run is published"
+        ends = "the run is published"
+        if self.run is None or self.run.stopped is not None:
+            ends = "it continues with --engine plain" if self.run is None else "its stages are stored"
         lines = str(error).splitlines() or [type(error).__name__]
         note(
             f"Prefect's server does not answer as expected ({lines[0][:MOST_LETTERS]}), and misses this survey: {ends}"

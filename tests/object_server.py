@@ -5,10 +5,14 @@ It serves S3 only: moto's server for all services selects a service at each requ
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Iterator
 from itertools import count
+from pathlib import Path
+from tempfile import NamedTemporaryFile
 from threading import Thread
+from typing import Any
 
 import pytest
 
@@ -50,3 +54,10 @@ def bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
     for name, value in {**KEYS, "AWS_ENDPOINT_URL": s3_server}.items():
         monkeypatch.setenv(name, value)
     return f"s3://{BUCKET}/archive-{next(_numbers)}"
+
+
+def overwrite(objects: Any, name: str, content: bytes) -> None:
+    """Replace an object of a bucket."""
+    with NamedTemporaryFile() as file:
+        Path(file.name).write_bytes(content)
+        objects.write(name, Path(file.name), hashlib.sha256(content).hexdigest())

@@ -58,7 +58,7 @@ def show_copied(content: Mapping[str, Any], console: Console) -> None:
         soft_wrap=True,
     )
     for uri in content["conflicts"]:
-        console.print(f"{uri} was not copied: the other side has another run of this name.", soft_wrap=True)
+        console.print(f"{uri} was not copied: the other side has it with other content.", soft_wrap=True)
     for uri in content["missing"]:
         console.print(f"{uri}, which a copied run names, is in neither place.", soft_wrap=True)
     for name in content["bad_names"]:

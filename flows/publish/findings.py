@@ -330,7 +330,7 @@ def _expected(plan: SurveyPlan, ref: Ref, unscored: str) -> dict[str, Any] | Non
     score = scores.expected(expected_counts(strips, len(names)), plan.step, exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None
-    if score.error > MOST_ERROR:
+    if not score.error <= MOST_ERROR:  # or NaN
         text = f"no expected score: it would be off by {format_points(score.error)} points (one standard deviation)"
         return {"not_predicted": f"{text}; judge the map by labels"}
     of_classes = {name: float(iou) for name, iou in zip(names, score.per_class_iou, strict=True) if np.isfinite(iou)}

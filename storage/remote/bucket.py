@@ -12,8 +12,8 @@ from __future__ import annotations
 import hashlib
 import secrets
 from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from spectralzoom.storage.store import (
     Archive,
     check_store,
     conflicts,
+    damage,
     digest_of,
     inputs_first,
     is_cleared,
@@ -50,8 +51,8 @@ Report = Callable[[str, float], None]  # address, and the fraction that is done
 class Copied:
     """Stores and runs that were copied, the bytes of their files, and the number of those that were there before.
 
-    ``conflicts`` are runs that were not copied, since another run has their name; ``missing`` are stores that copied
-    runs name, and that are in neither place. ``bad_names`` are objects in the bucket that no client can ask for.
+    ``conflicts`` are stores and runs that both sides have with other content; ``missing`` are stores that copied runs
+    name, and that are in neither place. ``bad_names`` are objects in the bucket that no client can ask for.
     """
 
     copied: list[str]
@@ -67,7 +68,7 @@ def push(archive: Archive, objects: Objects, report: Report) -> Copied:
 
     Files of stores that were cleared or removed here stay in the bucket. Raises UnreachableError: the bucket refuses or
     does not answer; ArchiveError: the bucket ignores conditional puts; IncompleteStoreError, after all else was sent: a
-    store or run is damaged, or the bucket has an input of it with other content.
+    store or run is damaged, or the bucket has it, cleared, or an input of it with other content.
     """
     with archive.in_use():
         return send_stores(archive, objects, list(archive.manifests()), report)
@@ -81,21 +82,24 @@ def send_stores(
     waiting = [uri for uri in uris if there.get(uri) not in (MANIFEST, _manifest_name(archive.root / uri))]
     if waiting:
         _check_conditional_puts(objects)
-    digests: dict[str, str] = {}  # of stores in the bucket
+    digests: dict[str, str | None] = {}  # of stores in the bucket
 
     def digest_there(uri: str) -> str | None:
-        if uri not in digests and uri in there:
-            text = objects.read(f"{uri}/{there[uri]}", parse_manifest)
-            digests[uri] = "" if text is None else manifest_digest(parse_manifest(text))
-        return digests.get(uri)
+        if uri not in digests:
+            digests[uri] = _digest(uri, there, objects)
+        return digests[uri]
 
     def send(uri: str) -> int | None:
+        here, other = digest_of(archive.root / uri), digest_there(uri)
+        if here and other and here != other:  # it is cleared there, and runs rest on it
+            differ = f"its digest is {here[:12]} here and {other[:12]} there"
+            raise IncompleteStoreError(f"{uri} cannot be copied to {objects.url}: {differ}; {TO_ANOTHER}")
         size, text = _send(archive.root / uri, uri, objects)
         digests[uri] = manifest_digest(parse_manifest(text))
         return size
 
     known = {uri: try_manifest(archive.root / uri)[0] for uri in waiting}
-    return _copy(archive, objects, uris, known, report, send, digest_there, objects.url)
+    return _copy(archive, objects, uris, known, report, send, digest_there, digest_there, objects.url)
 
 
 def pull(objects: Objects, archive: Archive, report: Report, run: str | None = None) -> Copied:
@@ -120,9 +124,17 @@ def pull(objects: Objects, archive: Archive, report: Report, run: str | None = N
                 raise known[uri]["damage"]
             return fetch_store(uri, there[uri], objects, archive)
 
-        return _copy(
-            archive, objects, wanted, known, report, fetch, lambda uri: digest_of(archive.root / uri), archive.name
-        )
+        def digest_here(uri: str) -> str | None:
+            return digest_of(archive.root / uri)
+
+        digest_there = partial(_digest, there=there, objects=objects)
+        return _copy(archive, objects, wanted, known, report, fetch, digest_there, digest_here, archive.name)
+
+
+def _digest(uri: str, there: Mapping[str, str], objects: Objects) -> str | None:
+    """Return the digest of a store or run in the bucket; None if it is not there."""
+    text = objects.read(f"{uri}/{there[uri]}", parse_manifest) if uri in there else None
+    return None if text is None else manifest_digest(parse_manifest(text))
 
 
 def _lineage(uri: str, kind: str, objects: Objects) -> dict[str, Any] | None:
@@ -141,11 +153,13 @@ def _copy(
     waiting: Mapping[str, Mapping[str, Any]],
     report: Report,
     work: Callable[[str], int | None],
+    digest_there: Callable[[str], str | None],
     digest: Callable[[str], str | None],
     place: str,
 ) -> Copied:
     """Copy what waits, by its manifest, to a ``place`` whose stores have a ``digest``, inputs first.
 
+    The digests of the bucket (``digest_there``) are compared with those of the archive for all that was ``asked``.
     ``work`` returns the bytes, or None where another process was first. A store or run that is damaged, or whose input
     differs there, is left out with what rests on it; then its error is raised at the end.
     """
@@ -167,13 +181,11 @@ def _copy(
             total += size
     if failed:
         raise IncompleteStoreError(f"{next(iter(failed.values()))}. All that does not rest on it was copied")
-    runs = [uri for uri in asked if uri.startswith("runs/")]
-    named = {one for uri in runs if uri in copied for one in try_manifest(archive.root / uri)[0][RESTS_ON]}
-    both = [uri for uri in runs if uri not in copied and (archive.root / uri / MANIFEST).is_file()]
-    texts = some_at_a_time(lambda uri: objects.read(f"{uri}/{MANIFEST}", parse_manifest), both)
-    others = [
-        uri for uri, text in zip(both, texts, strict=True) if text != (archive.root / uri / MANIFEST).read_bytes()
-    ]
+    runs = [uri for uri in copied if uri.startswith("runs/")]
+    named = {one for uri in runs for one in try_manifest(archive.root / uri)[0][RESTS_ON]}
+    both = [(uri, own) for uri in asked if uri not in copied and (own := digest_of(archive.root / uri))]
+    digests = some_at_a_time(digest_there, [uri for uri, _ in both])
+    others = [uri for (uri, own), other in zip(both, digests, strict=True) if other not in (None, own)]
     missing = sorted(uri for uri in named if not is_known(archive.root / uri))
     there = len(asked) - len(copied) - len(others)
     return Copied(copied, total, there, others, missing, sorted(objects.bad_names))
@@ -187,9 +199,12 @@ def _send(folder: Path, uri: str, objects: Objects) -> tuple[int | None, bytes]:
     check_store(folder)
     kind, text = _manifest_name(folder), manifest_bytes(folder)
     files = parse_manifest(text)["files"] if kind == MANIFEST else {}
-    with suppress(FileNotFoundError):  # it is cleared meanwhile, or damaged
-        some_at_a_time(lambda name: objects.write(_address(uri, text, name), folder / name), files)
-    check_store(folder, every_byte=True)  # what was sent is what the manifest lists
+    try:
+        some_at_a_time(lambda name: objects.write(_address(uri, text, name), folder / name, files[name][1]), files)
+    except (FileNotFoundError, IncompleteStoreError) as error:  # it is cleared or made again meanwhile, or damaged
+        if kind == _manifest_name(folder) and text == manifest_bytes(folder):
+            raise damage(folder, f"a file of it has changed while it was sent ({error})") from error
+    check_store(folder)
     if kind != _manifest_name(folder) or text != manifest_bytes(folder):  # cleared, or made again
         return _send(folder, uri, objects)
     winner = objects.create(f"{uri}/{kind}", text)

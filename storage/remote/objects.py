@@ -11,7 +11,7 @@ import hashlib
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from functools import cache
@@ -154,11 +154,29 @@ class Objects:
 
         return self._ask(write, len(content))
 
-    def write(self, name: str, source: Path | bytes) -> None:
-        """Write an object from a file or bytes, replacing any old one; readers never see a part of it."""
-        size = len(source) if isinstance(source, bytes) else source.stat().st_size
+    def write(self, name: str, source: Path, sha256: str) -> None:
+        """Write an object from a file of an archive, replacing any old one; readers never see a part of it.
+
+        Raises IncompleteStoreError: what was sent has another SHA-256.
+        """
+        size = source.stat().st_size
         store = self._client(min(size, PART_BYTES), sending=True)
-        self._ask(lambda: store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2), size)
+
+        def write() -> str:
+            digest = hashlib.sha256()
+
+            def blocks() -> Iterator[bytes]:
+                with open_own(source) as file:
+                    while block := file.read(PART_BYTES):
+                        digest.update(block)
+                        yield block
+
+            content = blocks() if size > PART_BYTES else b"".join(blocks())
+            store.put(name, content, chunk_size=PART_BYTES, max_concurrency=2)
+            return digest.hexdigest()
+
+        if self._ask(write, size) != sha256:
+            raise IncompleteStoreError(f"{source} has changed since it was published (its SHA-256 differs)")
 
     def fetch(self, name: str, path: Path, size: int, sha256: str) -> None:
         """Write an object into a new file. Raises IncompleteStoreError: it is missing, or has other content."""

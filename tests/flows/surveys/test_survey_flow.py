@@ -22,6 +22,7 @@ from spectralzoom.flows.planning.plan_survey import plan_survey
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Request, Stores
 from spectralzoom.flows.survey import run_stages
+from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.storage.store import Archive, Ref
 from tests.exported_run import POSE
 from tests.flows.conftest import act_instead, newest_run, stages
@@ -245,3 +246,12 @@ def test_sigterm_in_a_stage(field_file: Any, server: str, monkeypatch: pytest.Mo
     assert ended.err.splitlines()[-1] == "terminated; run the same command to resume"
     assert command_line("survey", file).code == 0
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_the_note_on_a_lost_server_says_what_became_of_the_survey() -> None:
+    """A survey that was stopped before its map has stored stages and no run."""
+    notes: list[str] = []
+    whole = RunRef("runs/one", Path("x"))
+    for run in (whole, replace(whole, stopped=SurveyStopped("mosaic", "stages/rectify/k", "x"))):
+        assert survey_command.FlowWork(run).without_server(Settings(), OSError("timed out"), notes.append) is run
+    assert [note.rpartition(": ")[2] for note in notes] == ["the run is published", "its stages are stored"]

@@ -28,8 +28,9 @@ from spectralzoom.storage.remote.all_names import signed
 from spectralzoom.storage.remote.bucket import Copied, pull, push
 from spectralzoom.storage.remote.objects import Objects, UnreachableError
 from spectralzoom.storage.runs import clear_up, verify_everything
-from spectralzoom.storage.store import Archive, Ref, digest_of, is_cleared, manifest_text
+from spectralzoom.storage.store import Archive, Ref, digest_of, is_cleared, manifest_text, publish
 from tests.faulty_proxy import FAULTS, Choose, faulty_proxy
+from tests.object_server import overwrite
 from tests.storage.small_archive import make_store, publish_receipt, small_survey
 
 
@@ -61,7 +62,7 @@ def flip(bucket: str, ending: str) -> None:
     name = min(name for name in objects.listing() if name.endswith(ending))
     content = bytearray(objects.read(name) or b"")
     content[-9] ^= 4
-    objects.write(name, bytes(content))
+    overwrite(objects, name, bytes(content))
 
 
 @pytest.fixture
@@ -222,6 +223,29 @@ def test_a_pull_during_a_push_gets_whole_stores(archive: Archive, bucket: str, t
     assert seen == [1, 1, 1]
 
 
+@pytest.mark.parametrize("is_link", [False, True])
+def test_a_file_that_differs_only_while_it_is_sent_is_not_published(
+    archive: Archive, bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_link: bool
+) -> None:
+    """Another process replaces it after it was checked, and puts it back."""
+    write, aside, other = Objects.write, tmp_path / "aside", tmp_path / "other"
+    other.write_text("private")
+
+    def changed(self: Objects, name: str, source: Path, sha256: str) -> None:
+        source.rename(aside)
+        source.symlink_to(other) if is_link else source.write_bytes(aside.read_bytes()[::-1])
+        try:
+            write(self, name, source, sha256)
+        finally:
+            aside.replace(source)
+
+    monkeypatch.setattr(Objects, "write", changed)
+    with pytest.raises((ArchiveError, IncompleteStoreError), match=r"data\.bin (has changed|is a link)"):
+        send(archive, bucket)
+    assert problems(archive.root) == []
+    assert not [name for name in Objects(bucket).listing() if name.endswith("manifest.json")]
+
+
 def test_a_store_cleared_meanwhile_is_sent_as_cleared(archive: Archive, bucket: str, broken: Broken) -> None:
     """Another survey deletes its raw lines while they are sent."""
     raw = archive.refs("capture")[0]
@@ -292,6 +316,26 @@ def test_a_stopped_push_continues(
     assert {uri.split("/")[1] for uri in fetch(bucket, tmp_path / "there")[1].copied} == {"capture", "rectify"}
     assert len(send(archive, bucket).copied) == 2
     assert contents(fetch(bucket, tmp_path / "there")[0].root) == contents(archive.root)
+
+
+@pytest.mark.parametrize("is_cleared_there", [False, True])
+def test_other_content_of_a_store_is_named_without_a_run(bucket: str, tmp_path: Path, is_cleared_there: bool) -> None:
+    """A push tells of a store that the bucket has otherwise; the run that rests on it there can be pulled."""
+    first, other = (Archive.open(tmp_path / name) for name in ("first", "other"))
+    raw = small_survey(first, seed=4).raw
+    if is_cleared_there:
+        first.clear(raw)
+    send(first, bucket)
+    publish(other.root / raw.uri, lambda folder: (folder / "data.bin").write_text("another light") and {})
+    if is_cleared_there:
+        with pytest.raises(
+            IncompleteStoreError, match=f"^{raw.uri} cannot be .* digest is .{{12}} here and .{{12}} there"
+        ):
+            send(other, bucket)
+    else:
+        assert send(other, bucket).conflicts == [raw.uri]
+    assert len(fetch(bucket, tmp_path / "third")[0].runs()) == 1
+    assert problems(tmp_path / "third") == []
 
 
 def test_the_first_writer_of_a_store_wins(bucket: str, tmp_path: Path) -> None:
@@ -372,9 +416,9 @@ def test_a_hostile_manifest_is_refused(bucket: str, tmp_path: Path, files: dict[
     """Nothing is written outside of its store, nor more than it declares."""
     text = manifest_text({"files": files}).encode()
     place, objects = "stages/x/y", Objects(bucket)
-    objects.write(f"{place}/manifest.json", text)
+    overwrite(objects, f"{place}/manifest.json", text)
     for name in ("a", "a/b", "n" * 300):
-        objects.write(f"{place}/{hashlib.sha256(text).hexdigest()[:16]}/{name}", bytes(9))
+        overwrite(objects, f"{place}/{hashlib.sha256(text).hexdigest()[:16]}/{name}", bytes(9))
     with pytest.raises((ArchiveError, IncompleteStoreError), match=words):
         fetch(bucket, tmp_path / "there")
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
@@ -385,7 +429,7 @@ def test_addresses_that_lead_out_of_the_archive_are_ignored(archive: Archive, bu
     """Objects of other programs lie in the bucket, some with hostile names."""
     send(archive, bucket)
     for name in ("manifest.json", "runs/a b/manifest.json", "stages/x/.hidden/manifest.json", "notes/manifest.json"):
-        Objects(bucket).write(name, b"{}")
+        overwrite(Objects(bucket), name, b"{}")
     other, _ = fetch(bucket, tmp_path / "there")
     assert contents(other.root) == contents(archive.root)
 
@@ -643,7 +687,7 @@ def test_the_rest_of_a_bucket_with_a_damaged_store_is_pulled(bucket: str, tmp_pa
     bad, good = small_survey(one, seed=1), small_survey(one, seed=2)
     send(one, bucket)
     name = next(name for name in Objects(bucket).listing() if bad.mosaic.uri in name and name.endswith("data.bin"))
-    Objects(bucket).write(name, b"x")
+    overwrite(Objects(bucket), name, b"x")
     with pytest.raises(IncompleteStoreError, match=rf"{name} has changed .*\. All that does not rest on it was copied"):
         fetch(bucket, tmp_path / "there")
     there = Archive.open(tmp_path / "there")
