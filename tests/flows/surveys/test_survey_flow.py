@@ -19,6 +19,7 @@ from spectralzoom.flows.local_server import ServerUnavailable
 from spectralzoom.flows.opening.open_field import open_field
 from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.planning.plan_survey import plan_survey
+from spectralzoom.flows.publish.publishing import RunRef
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Request, Stores
 from spectralzoom.flows.survey import run_stages
