@@ -28,6 +28,7 @@ from spectralzoom.storage.whole_files import aside, check_no_link, files_in, rem
 
 HOST = "127.0.0.1"
 STARTED_WITHIN_S, ENDED_WITHIN_S, SENT_WITHIN_S, ANSWERED_WITHIN_S = 120.0, 10.0, 10.0, 5.0
+LATER = (429, 503)  # statuses
 CONSOLE = "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL"
 QUIET = {  # no requests to other machines, no output on the terminal
     "server.analytics_enabled": False,
@@ -136,11 +137,19 @@ def sent(within_s: float) -> bool:
 
 
 def silence_of(address: str, within_s: float = ANSWERED_WITHIN_S) -> str | None:
-    """Return why the Prefect server at an address does not answer; None where it does, with a refusal too."""
+    """Return why the Prefect server at an address does not answer; None where it does, with a refusal too.
+
+    A server that asks to come back later is silent: Prefect would wait as long as it asks, at each request.
+    """
     import httpx
 
+    end = time.monotonic() + within_s
     try:
-        httpx.get(f"{address.rstrip('/')}/health", timeout=within_s)
+        with httpx.stream("GET", f"{address.rstrip('/')}/health", timeout=within_s) as answer:
+            if answer.status_code in LATER:
+                return f"it answers {answer.status_code} {answer.reason_phrase}"
+            if any(time.monotonic() > end for _ in answer.iter_raw()):
+                return f"its answer takes more than {within_s:g} s"
     except (httpx.HTTPError, httpx.InvalidURL) as error:
         return str(error) or type(error).__name__
     return None
@@ -167,7 +176,17 @@ def private_files(home: Path) -> str:
         write_new(password, f"spectralzoom:{secrets.token_urlsafe(24)}\n")
     if not (home / "prefect.db").exists():
         copy_tables(home / "prefect.db")
+    check_tables(home / "prefect.db")
     return password.read_text(encoding="utf-8").strip()
+
+
+def check_tables(database: Path) -> None:
+    """Raise sqlite3.Error for a database that is damaged, or that another process keeps locked."""
+    with closing(sqlite3.connect(database, timeout=ANSWERED_WITHIN_S)) as tables:
+        if (found := tables.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+            raise sqlite3.DatabaseError(f"prefect.db is damaged: {found}; remove it")
+        tables.execute("BEGIN IMMEDIATE")
+        tables.rollback()
 
 
 def close_folder(home: Path) -> bool:

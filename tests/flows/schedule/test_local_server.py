@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import socket
 import sqlite3
+import time
 from collections.abc import Iterator
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from pathlib import Path
 
 import httpx
@@ -15,7 +18,14 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from spectralzoom.flows.local_server import ServerUnavailable, copy_tables, local_server, private_files
+from spectralzoom.flows.local_server import (
+    ServerUnavailable,
+    check_tables,
+    copy_tables,
+    local_server,
+    private_files,
+    silence_of,
+)
 
 FOREIGN = "http://evil.example"
 
@@ -138,3 +148,51 @@ def test_other_users_cannot_open_the_folder(home: Path, api: str, user: tuple[st
     """It was open before. The password is in no variable, so that no list of processes can show it."""
     assert home.stat().st_mode & 0o777 == 0o700
     assert user[1] not in str(os.environ)
+
+
+@pytest.mark.parametrize("harm", ["damaged", "no database", "locked"])
+def test_a_database_that_cannot_serve_is_refused(harm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server would try again for minutes; a survey runs without it."""
+    monkeypatch.setattr("spectralzoom.flows.local_server.ANSWERED_WITHIN_S", 0.2)
+    place = tmp_path / "prefect.db"
+    with closing(sqlite3.connect(place)) as tables:
+        tables.execute("CREATE TABLE one (x)")
+        tables.executemany("INSERT INTO one VALUES (?)", [(number,) for number in range(9999)])
+        tables.commit()
+        check_tables(place)
+        if harm == "locked":
+            tables.execute("BEGIN EXCLUSIVE")
+        else:
+            content = bytearray(place.read_bytes())
+            content[:100] = b"x" * 100 if harm == "no database" else content[:100]
+            content[4096:] = bytes(len(content) - 4096)
+            place.write_bytes(content)
+        with pytest.raises(sqlite3.Error):
+            check_tables(place)
+
+
+@pytest.mark.parametrize(
+    ("head", "body", "why"),
+    [
+        ("200 OK", [b"true"], None),
+        ("401 Unauthorized", [b"no"], None),
+        ("503 Service Unavailable\r\nRetry-After: 90", [b"later"], "it answers 503 Service Unavailable"),
+        ("429 Too Many Requests", [b""], "it answers 429 Too Many Requests"),
+        ("200 OK", [b"t"] * 40, "its answer takes more than 0.3 s"),
+    ],
+)
+def test_a_server_that_puts_off_is_silent(head: str, body: list[bytes], why: str | None) -> None:
+    """A refusal is an answer; a wish to wait, or a body that never ends, is none."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def answer() -> None:
+            with listening.accept()[0] as line, suppress(OSError):
+                line.recv(9999)
+                line.sendall(f"HTTP/1.1 {head}\r\nConnection: close\r\n\r\n".encode())
+                for part in body:
+                    line.sendall(part)
+                    time.sleep(0.05 * (len(body) > 1))
+
+        with ThreadPoolExecutor(1) as team:
+            team.submit(answer)
+            assert silence_of(f"http://127.0.0.1:{listening.getsockname()[1]}/api", 0.3) == why
