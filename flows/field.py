@@ -15,7 +15,7 @@ from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RECORDED, RIG
 from spectralzoom.flows.tasks.observer import current_observer
 from spectralzoom.flows.tasks.patch_budget import SHARD
-from spectralzoom.flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
+from spectralzoom.flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior, inherited_warning
 from spectralzoom.flows.tasks.recorded_field import open_recorded, recorded_scene
 from spectralzoom.flows.tasks.rig_field import RigHold, rig_source
 from spectralzoom.flows.tasks.scene import (
@@ -215,7 +215,7 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
         raster=raster,
         prior=prior,
         notes=(*notes, *zones.notes, *prior_notes, *label_notes),
-        warnings=(*darkness(settings), *training_warning(outside, model.path)),
+        warnings=(*darkness(settings), *training_warning(outside, model.path), *inherited_warning(prior, settings)),
         refused=refused,
     )
 

@@ -19,7 +19,7 @@ from spectralzoom.flows.stages.score import load_plan, read_in_full
 from spectralzoom.flows.stages.segment import SPECTRA
 from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES
-from spectralzoom.flows.tasks.scores import MOST_ERROR
+from spectralzoom.flows.tasks.scores import MOST_ERROR, warning_column
 from spectralzoom.flows.terminal.figures import format_count, format_points
 from spectralzoom.models.evaluation.expected_scores import ENOUGH_PX, expected_counts
 from spectralzoom.models.evaluation.unlike_scenes import UNLIKE
@@ -279,12 +279,13 @@ def _ground_m2(plan: SurveyPlan, kept: NDArray[np.bool_]) -> float | None:
     return None if areas is None else float(np.nansum(areas[kept]))
 
 
-def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
-    """Return the figures of all plots as CSV, one row for each plot; unknown cells are empty."""
+def plots_csv(plots: Sequence[Mapping[str, Any]], warnings: Sequence[str] = ()) -> str:
+    """Return figures of all plots and warnings about their map as CSV, a row for each; unknown cells are empty."""
     names = list(plots[0]["fractions"]) if plots else []
     facts = ("plot", "pixels", "mapped_pixels", "area_m2", "confidence")
     columns = {fact: [plot[fact] for plot in plots] for fact in facts}
-    return csv_table(columns | {f"fraction_{name}": [plot["fractions"][name] for plot in plots] for name in names})
+    fractions = {f"fraction_{name}": [plot["fractions"][name] for plot in plots] for name in names}
+    return csv_table(columns | fractions | warning_column(warnings, len(plots)))
 
 
 def _map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
