@@ -132,12 +132,8 @@ def _by_role(
             judges = [one.path.name for one, run in zip(candidates, own, strict=True) if run]
             found[role] = {"frames": frames, "judges": judges, **summarise(some, names, fractions, patch)}
     headline = next((role for role in found if role != VALIDATION), None)
-    shown = (
-        {"frames": [], "judges": [], "brief": {}, "rows": [], "support": {}}
-        if headline is None
-        else found.pop(headline)
-    )
-    return {"headline": headline, **shown, "apart": found}
+    nothing: dict[str, Any] = {"frames": [], "judges": [], "brief": {}, "rows": [], "support": {}}
+    return {"headline": headline, **found.pop(headline or "", nothing), "apart": found}
 
 
 def print_evaluation(content: dict[str, Any], console: Console) -> None:
