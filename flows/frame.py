@@ -77,6 +77,7 @@ class Prior:
     days: float  # between that visit and this one
     day_of_year: float | None  # of this visit; None if it is unknown
     classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
+    warned: bool = False  # its map has a warning
 
     @property
     def key(self) -> dict[str, object]:

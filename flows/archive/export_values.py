@@ -14,7 +14,7 @@ import shapely
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.flows.archive.export_layers import ExportedRun, geobox_of, layer_of, warning_tag
-from spectralzoom.flows.publish.scores import warnings_of
+from spectralzoom.flows.publish.scores import warning_column, warnings_of
 from spectralzoom.models.evaluation.metrics import stratified_fractions
 from spectralzoom.pipeline.errors import ArchiveError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
@@ -43,6 +43,7 @@ BYTES_AT_ONCE = 1 << 27
 COLUMNS_AT_ONCE = 640
 GEOPACKAGE, SHAPEFILE = "application/geopackage+sqlite3", "application/vnd.shp"
 PARTS = (".shp", ".shx", ".dbf", ".cpg", ".prj")  # of a shapefile
+MOST_TEXT = 254  # bytes of a value in it
 EQUAL_AREA = 6933  # EPSG code of a CRS in which areas are true all over the earth
 
 
@@ -78,7 +79,7 @@ def write_areas(run: ExportedRun, path: Path) -> None:
         "estimated_fraction": estimate,
         "standard_error": error,
     }
-    write_whole(path, csv_table(columns))
+    write_whole(path, csv_table(columns | warning_column(warnings_of(run.receipt), len(names))))
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,8 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     """Write a polygon for each region of a class; return key, path and media type of both files.
 
     Outlines follow the sides of pixels. Columns are class, name and colour, with a place on the earth also hectares,
-    and with ``doses`` also dose, 0 for other classes. Raises ArchiveError: GDAL or the disk refuses.
+    and with ``doses`` also dose, 0 for other classes. A shapefile has no
+    metadata: warnings about the map are another column of it. Raises ArchiveError: GDAL or the disk refuses.
     """
     import geopandas
     import pyogrio
@@ -226,8 +228,10 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     try:
         with written_aside(folder, [package.name, *parts]) as aside, warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)
-            about = warning_tag(warnings_of(run.receipt))
+            about = warning_tag(warned := warnings_of(run.receipt))
             frame.to_file(aside / package.name, layer="classes", driver="GPKG", layer_metadata=about or None)
+            for name, texts in warning_column(warned, len(frame)).items():
+                frame[name] = [text.encode()[:MOST_TEXT].decode(errors="ignore") for text in texts]
             frame.to_file(aside / shapefile.name, driver="ESRI Shapefile", encoding="utf-8", **day)
     except pyogrio.errors.DataSourceError as error:
         raise ArchiveError(f"{package} cannot be written: {error}; is there space on the disk?") from error

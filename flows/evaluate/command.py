@@ -85,7 +85,7 @@ def evaluate_weights(
         ],
         "left_out": jobs.left_out,
         "settings": {"fractions": fractions, "seed": flags.seed, "camera": asdict(candidates[0].camera)},
-        **_by_role(runs, jobs, candidates[0], fractions),
+        **_by_role(runs, jobs, candidates, fractions),
         "data_notes": [*data.notes, *jobs.notes],
         "files": [] if flags.out is None else [str(flags.out / "evaluation.json")],
     }
@@ -116,24 +116,31 @@ def _judge_frames(
     return runs
 
 
-def _by_role(runs: Sequence[Run], jobs: Jobs, first: Candidate, fractions: Sequence[float]) -> dict[str, Any]:
-    """Return the figures of the headline, none of validation frames, and ``apart`` those of the other frames."""
+def _by_role(
+    runs: Sequence[Run], jobs: Jobs, candidates: Sequence[Candidate], fractions: Sequence[float]
+) -> dict[str, Any]:
+    """Return the figures of the headline, none of validation frames, and ``apart`` those of the other frames.
+
+    ``judges`` are the files with a frame of the headline.
+    """
     found: dict[str, dict[str, Any]] = {}
-    names, patch = first.described.class_names, first.described.config.patch
+    names, patch = candidates[0].described.class_names, candidates[0].described.config.patch
     for role in ROLES:
         own = [{name: run[name] for name in run if jobs.frames[name][at] == role} for at, run in enumerate(runs)]
         if some := [run for run in own if run]:
             frames = [name for name, roles in jobs.frames.items() if role in roles.values()]
-            found[role] = {"frames": frames, **summarise(some, names, fractions, patch)}
+            judges = [one.path.name for one, run in zip(candidates, own, strict=True) if run]
+            found[role] = {"frames": frames, "judges": judges, **summarise(some, names, fractions, patch)}
     headline = next((role for role in found if role != VALIDATION), None)
-    shown = {"frames": [], "brief": {}, "rows": [], "support": {}} if headline is None else found.pop(headline)
-    return {"headline": headline, **shown, "apart": found}
+    nothing: dict[str, Any] = {"frames": [], "judges": [], "brief": {}, "rows": [], "support": {}}
+    return {"headline": headline, **found.pop(headline or "", nothing), "apart": found}
 
 
 def print_evaluation(content: dict[str, Any], console: Console) -> None:
     """Print frames and weights, rows of frames apart, accuracy with costs, the classes, and an explanation."""
     weights = content["weights"]
-    named = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
+    judges = content["judges"] or [one["file"] for one in weights]
+    named = f"{len(judges)} sets of weights" if len(judges) > 1 else judges[0]
     left = f"; left out (training frames): {len(content['left_out'])}" if content["left_out"] else ""
     lines = [_sentence(content["brief"], named, content["headline"]) if content["headline"] else NO_HEADLINE]
     lines += [f"{content['dataset']}: {counted(len(content['frames']), 'frame')}, {named}{left}"]

@@ -11,7 +11,7 @@ import numpy as np
 from spectralzoom.flows.field import Field
 from spectralzoom.flows.frame import FieldFrame, FieldLabels
 from spectralzoom.flows.observer import current_observer
-from spectralzoom.flows.opening.prior_maps import AUTO, NONE, find_prior
+from spectralzoom.flows.opening.prior_maps import AUTO, NONE, find_prior, inherited_warning
 from spectralzoom.flows.opening.recorded_field import open_recorded, recorded_scene
 from spectralzoom.flows.opening.rig_field import RigHold, rig_source
 from spectralzoom.flows.opening.scene import (
@@ -111,7 +111,11 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
         ),
         prior=prior,
         notes=(*notes, *_other_day(settings, scene), *zones.notes, *prior_notes, *label_notes),
-        warnings=(*darkness(settings), *_beyond_training(settings, scene, model, raster)),
+        warnings=(
+            *darkness(settings),
+            *_beyond_training(settings, scene, model, raster),
+            *inherited_warning(prior, settings),
+        ),
         refused=refused,
     )
 

@@ -9,9 +9,10 @@ from pathlib import Path
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.flows.frame import Prior
+from spectralzoom.flows.publish.scores import warnings_of
 from spectralzoom.flows.settings.load import anchor_paths
 from spectralzoom.flows.settings.settings import Settings
-from spectralzoom.flows.settings.values import BUILT_IN_SCENES, PART
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES, PART, WHOLE
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX, shift_px
@@ -59,6 +60,15 @@ def find_prior(
         runs_by_reason.setdefault(found, []).append(run.folder.name)
     why = "none of its earlier runs can be one" if runs_by_reason else "the archive has no earlier visit"
     return None, (*_unusable(runs_by_reason), f"{name} has no prior map: {why}")
+
+
+def inherited_warning(prior: Prior | None, settings: Settings) -> tuple[str, ...]:
+    """Return the warning that places of a partial scan keep a prior map which has a warning; or nothing."""
+    if prior is None or not prior.warned or settings.extent == WHOLE:
+        return ()
+    shown = f"spectralzoom explain ARCHIVE {prior.run}"
+    what = f"places that are not captured again keep the prior map {prior.run}, which has a warning"
+    return (f"{what} ({shown}); --extent whole captures all",)
 
 
 def _unusable(runs_by_reason: dict[str, list[str]]) -> tuple[str, ...]:
@@ -124,7 +134,7 @@ def _usable(
     day = None if settings.moment is None else float(settings.moment[0])
     if (called := moment_of(dated(settings.visit, scene.acquired))) is not None:
         day = float(called.timetuple().tm_yday)
-    return Prior(run.folder.name, probabilities, mosaic, days, day, classes)
+    return Prior(run.folder.name, probabilities, mosaic, days, day, classes, bool(warnings_of(run.receipt)))
 
 
 def _off_grid(shape: tuple[int, int], before: GeoBox | None, grid: SceneGrid, scene: RasterScene) -> str | None:

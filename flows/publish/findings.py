@@ -13,7 +13,7 @@ from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.planning.capture_plan import as_figures
 from spectralzoom.flows.products import Products
 from spectralzoom.flows.publish.class_sentence import main_places
-from spectralzoom.flows.publish.scores import MOST_ERROR
+from spectralzoom.flows.publish.scores import MOST_ERROR, warning_column
 from spectralzoom.flows.stages.condense import SIGNAL_RECORD
 from spectralzoom.flows.stages.ground import STORE
 from spectralzoom.flows.stages.register import load_registration
@@ -278,12 +278,13 @@ def _ground_m2(plan: SurveyPlan, kept: NDArray[np.bool_]) -> float | None:
     return None if areas is None else float(np.nansum(areas[kept]))
 
 
-def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
-    """Return the figures of all plots as CSV, one row for each plot; unknown cells are empty."""
+def plots_csv(plots: Sequence[Mapping[str, Any]], warnings: Sequence[str] = ()) -> str:
+    """Return figures of all plots and warnings about their map as CSV, a row for each; unknown cells are empty."""
     names = list(plots[0]["fractions"]) if plots else []
     facts = ("plot", "pixels", "mapped_pixels", "area_m2", "confidence")
     columns = {fact: [plot[fact] for plot in plots] for fact in facts}
-    return csv_table(columns | {f"fraction_{name}": [plot["fractions"][name] for plot in plots] for name in names})
+    fractions = {f"fraction_{name}": [plot["fractions"][name] for plot in plots] for name in names}
+    return csv_table(columns | fractions | warning_column(warnings, len(plots)))
 
 
 def _map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:

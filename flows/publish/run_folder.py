@@ -71,7 +71,7 @@ def publish_run(
         page = render_report(receipt, quicklook, field_map(shown, plan.field.prior))
         write_new(folder / "quicklook.png", quicklook)
         if "plots" in receipt:
-            write_new(folder / PLOTS_FILE, plots_csv(receipt["plots"]))
+            write_new(folder / PLOTS_FILE, plots_csv(receipt["plots"], receipt.get("warnings", ())))
         write_new(folder / RECEIPT, to_json(receipt))
         write_new(folder / REPORT, page)
         return {"survey": receipt["survey"], "settings": receipt["settings"]}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from spectralzoom.flows.terminal.figures import format_count, format_points, spaced
@@ -21,6 +21,11 @@ def warnings_of(receipt: Mapping[str, Any]) -> list[str]:
     """Return the warnings about a run's map; none of a receipt with something else in their place."""
     found = receipt.get("warnings")
     return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
+
+
+def warning_column(warnings: Sequence[str], rows: int) -> dict[str, list[str]]:
+    """Return the column of a table that repeats the warnings about its map in every row; none without any."""
+    return {"warning": ["; ".join(warnings)] * rows} if warnings else {}
 
 
 def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.opening.scene import scene_of_file
-from spectralzoom.flows.terminal.figures import counted
+from spectralzoom.flows.terminal.figures import counted, format_percent
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
@@ -283,7 +283,7 @@ def zero_cure(kind: str) -> str:
 
 def zero_sentence(name: str = "", fraction: float = 0.0) -> str:
     """Return what label 0 stands for: a class of that name, or unlabelled; empty where all labels are others."""
-    share = f"{fraction:.1%} of the pixels"
+    share = f"{format_percent(fraction)} of the pixels"
     if name:
         return "; ".join(filter(None, (f"label 0 is the class {name}: {share}", zero_cure(name))))
     way = f"a table [classes] in a {SETTINGS_NAME} can name it: NAME = 0"

@@ -138,6 +138,19 @@ def test_folds_have_their_own_validation_frames(data: Path, tmp_path: Path):
     assert content["rows"][0]["by_weights"][0] == first["rows"][0]["miou"]
 
 
+@pytest.mark.parametrize(("validated", "words"), [(FRAMES, "0.safetensors"), (("001",), "2 sets of weights")])
+def test_the_headline_names_the_weights_that_judged(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], validated: tuple[str, ...], words: str
+) -> None:
+    """Weights that have validation frames alone are none of them."""
+    splits = [{}, {"validation": {name: scene_at(data, name).key for name in validated}}]
+    weights = tuple(write_weights(tmp_path / f"{n}.safetensors", n, split=one) for n, one in enumerate(splits))
+    run_evaluate(str(data), EvaluateFlags(weights=weights, fractions=""), Console(width=200))
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"mIoU, held out: {words} ")
+    assert second.endswith(f"3 frames, {words}")
+
+
 def test_untrained_pixels_are_in_no_headline_beside_held_out_frames(data: Path, tmp_path: Path):
     """They are no forecast for other scenes."""
     scene = scene_at(data)

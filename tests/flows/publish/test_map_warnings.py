@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import re
@@ -25,7 +26,7 @@ from spectralzoom.flows.archive.plan_command import plan_content, show_plan
 from spectralzoom.flows.archive.reprocess_command import reprocess_fields
 from spectralzoom.flows.cli.tiles import tile_row
 from spectralzoom.flows.publish import publishing, run_folder
-from spectralzoom.flows.publish.findings import no_expected_score
+from spectralzoom.flows.publish.findings import no_expected_score, plots_csv
 from spectralzoom.flows.publish.publishing import RunRef, outcome
 from spectralzoom.flows.publish.receipt_table import format_score, print_summary
 from spectralzoom.flows.settings.settings import load_settings
@@ -154,6 +155,10 @@ def test_exports_have_the_warnings(asked: dict[str, Any], surveyed: dict[str, An
             assert file.tags().get("WARNING", "") == "; ".join(warned)
     layer = pyogrio.read_info(tmp_path / done["files"]["polygons"], layer="classes")["layer_metadata"] or {}
     assert layer.get("WARNING", "") == "; ".join(warned)
+    areas = list(csv.DictReader((tmp_path / done["files"]["areas"]).read_text(encoding="utf-8").splitlines()))
+    outlines = pyogrio.read_dataframe(tmp_path / done["files"]["polygons_shapefile"])
+    assert {row.get("warning", "") for row in areas} == {"; ".join(warned)}
+    assert set(outlines.get("warning", [""])) == {"; ".join(warned)[:254]}
 
 
 def test_reprocessed_fields_have_the_warnings(asked: dict[str, Any], surveyed: dict[str, Any]) -> None:
@@ -173,6 +178,14 @@ def test_the_quicklook_has_the_warnings(
     for words in ("", BEYOND):
         run_survey(load_settings(None, asked[words]), QUIET)
     assert [one.about.startswith("Warning: outside of the training") for one in drawn] == [False, True]
+
+
+def test_plots_have_the_warnings() -> None:
+    """A column repeats them, which a table without any lacks."""
+    plots = [{"plot": one, "pixels": 4, "mapped_pixels": 4, "area_m2": None, "confidence": 0.9} for one in "ab"]
+    plots = [one | {"fractions": {"soil": 1.0}} for one in plots]
+    rows = [list(csv.DictReader(plots_csv(plots, told).splitlines())) for told in ([], ["dark", "cold, wet"])]
+    assert [[row.get("warning") for row in some] for some in rows] == [[None] * 2, ["dark; cold, wet"] * 2]
 
 
 @pytest.mark.parametrize("found", ["outside", 7, [3, {}], {"a": 1}, None])

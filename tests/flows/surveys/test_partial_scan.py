@@ -16,11 +16,14 @@ import xarray as xr
 from rich.console import Console
 
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
+from spectralzoom.flows.opening import prior_maps
+from spectralzoom.flows.opening.open_field import open_field
 from spectralzoom.flows.plan import ReadingPlan
 from spectralzoom.flows.planning import extent_choice
 from spectralzoom.flows.planning.extent_choice import ExtentGains
 from spectralzoom.flows.planning.patch_budget import SHARD
 from spectralzoom.flows.planning.plan_survey import compared_px
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.stages.drawing import Drawing
 from spectralzoom.models.network.sizes import MultiplyAdds, TemporalSizes
 from spectralzoom.models.network.temporal_reader import TemporalReader
@@ -31,7 +34,7 @@ from spectralzoom.pipeline.errors import BudgetError, PipelineError, SettingsErr
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance
 from spectralzoom.storage.runs import read_run
-from tests.conftest import QUIET, Survey, WeightsMaker
+from tests.conftest import QUIET, Flags, Survey, WeightsMaker
 from tests.prior_work import without_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -73,6 +76,24 @@ def visited(visits: tuple[Path, Any, Any], tmp_path: Path) -> Path:
 def product(out: Path, published: Any, name: str) -> xr.Dataset:
     """Return a store of a run."""
     return xr.open_zarr(out / published.receipt["products"][name], consolidated=False)
+
+
+@pytest.mark.parametrize("later", [PART, {**WHOLE, "prior": "latest"}], ids=["part", "whole"])
+@pytest.mark.parametrize("warned", [True, False], ids=["warned", "plain"])
+def test_a_partial_scan_has_the_warning_of_its_prior_map(
+    visits: tuple[Path, Any, Any],
+    flags_png: Flags,
+    recorded: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    later: dict[str, Any],
+    warned: bool,
+) -> None:
+    """A scan of the whole field captures every place again, and has none."""
+    monkeypatch.setattr(prior_maps, "warnings_of", lambda receipt: ["dark"] if warned else [])
+    field = open_field(load_settings(None, flags_png(visits[0], **later, visit=LAST, weights=str(recorded))))
+    assert field.prior is not None
+    inherited = [one for one in field.warnings if f"keep the prior map {field.prior.run}, which has a warning" in one]
+    assert bool(inherited) == (warned and later is PART)
 
 
 def test_a_partial_scan_maps_the_rest_from_the_prior_map(visits: tuple[Path, Any, Any]) -> None:

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from spectralzoom.flows.evaluate.command import evaluate_weights
 from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
+from spectralzoom.flows.terminal.figures import format_percent
 from spectralzoom.flows.training.data import open_training_data, zero_sentence
 from spectralzoom.flows.training.train import run_train
 from spectralzoom.flows.training.train_scenes import CAMERA, TrainRequest, observe_all
@@ -46,11 +47,9 @@ def _told(path: Path) -> str:
 
 
 GREEN = np.where(KINDS[..., None] == 0, 0, [0, 200, 0]).astype(np.uint8)
-CLASS_0 = "label 0 is the class class_0: 62.5% of the pixels; if it means unlabelled, write unlabelled = 0 into a scene"
-BARE = "label 0 is the class bare: 62.5% of the pixels"
-NONE = (
-    "label 0 is no class, 62.5% of the pixels are unlabelled; a table [classes] in a scene.toml can name it: NAME = 0"
-)
+CLASS_0 = "label 0 is the class class_0: 62 % of the pixels; if it means unlabelled, write unlabelled = 0 into a scene"
+BARE = "label 0 is the class bare: 62 % of the pixels"
+NONE = "label 0 is no class, 62 % of the pixels are unlabelled; a table [classes] in a scene.toml can name it: NAME = 0"
 THIRD = np.where(np.arange(40) < 10, 3, KINDS)  # with 0, 3 and 5
 
 
@@ -60,12 +59,12 @@ THIRD = np.where(np.arange(40) < 10, 3, KINDS)  # with 0, 3 and 5
         (KINDS, "npy", "", CLASS_0),
         (KINDS.astype(np.float32), "npy", "", CLASS_0),
         (KINDS, "png", "", CLASS_0),
-        (GREEN, "png", "", "label 0 is the class colour_000000: 62.5% of the pixels; .* unlabelled = [0, 0, 0] into"),
+        (GREEN, "png", "", "label 0 is the class colour_000000: 62 % of the pixels; .* unlabelled = [0, 0, 0] into"),
         (KINDS, "npy", NAMED, BARE),
         (GREEN, "png", "[classes]\nbare = [0, 0, 0]\nwheat = [0, 200, 0]\n", BARE),
-        (THIRD, "png", "unlabelled = 0\n", "label 0 is no class, 50.0% of the pixels are unlabelled"),
+        (THIRD, "png", "unlabelled = 0\n", "label 0 is no class, 50 % of the pixels are unlabelled"),
         (np.where(KINDS == 0, 300, KINDS.astype(np.int32)), "npy", "", ""),
-        (np.where(THIRD == 0, -1, THIRD.astype(np.int16)), "npy", "", "label 0 is no class, 50.0% of the pixels are"),
+        (np.where(THIRD == 0, -1, THIRD.astype(np.int16)), "npy", "", "label 0 is no class, 50 % of the pixels are"),
     ],
     ids=["array", "floats", "picture", "colours", "named", "named colours", "unlabelled", "others", "negative"],
 )
@@ -79,6 +78,11 @@ def test_the_sentence_of_a_file(tmp_path: Path, labels: np.ndarray, ending: str,
     assert told.endswith("beside the scene") == (words == CLASS_0 or "colour" in words)
 
 
+def test_a_few_pixels_are_not_none() -> None:
+    """One pixel of 4096 is a share above 0."""
+    assert "class_0: < 0.1 % of the pixels" in zero_sentence("class_0", 1 / 4096)
+
+
 @pytest.mark.parametrize("toml", ["", "unlabelled = 0\n"])
 def test_the_sentence_of_a_folder(tmp_path: Path, toml: str) -> None:
     """Pixels of all scenes count together."""
@@ -89,7 +93,7 @@ def test_the_sentence_of_a_folder(tmp_path: Path, toml: str) -> None:
     (tmp_path / "scene.toml").write_text(f"wavelengths_nm = [640, 550, 460]\n{toml}")
     share = ((THIRD == 0).sum() + (THIRD[:, :20] == 0).sum()) / (THIRD.size * 1.5)
     kind = "no class," if toml else "the class class_0:"
-    assert _told(tmp_path).startswith(f"label 0 is {kind} {share:.1%} of the pixels")
+    assert _told(tmp_path).startswith(f"label 0 is {kind} {format_percent(share)} of the pixels")
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -110,7 +114,7 @@ def test_the_sentence_of_polygons(tmp_path: Path, first: int) -> None:
     areas = {"type": "FeatureCollection", "crs": crs, "features": [area(first, 0, 4), area(7, 10, 30)]}
     (tmp_path / "field.geojson").write_text(json.dumps(areas))
     (tmp_path / "scene.toml").write_text(NM)
-    words = ("the class class_0: 10.0%", "no class, 40.0%")[first]
+    words = ("the class class_0: 10 %", "no class, 40 %")[first]
     assert _told(path).startswith(f"label 0 is {words} of the pixels")
 
 
