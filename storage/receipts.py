@@ -119,7 +119,7 @@ class StageRow(_Part):
     """One stage; figures of a store that was found are null."""
 
     name: Name
-    key: Name | None = None  # None of a stage that is left out
+    key: Name | None  # None of a stage that is left out
     state: Literal["ran", "cached", "left out"]
     why: str = ""  # it is left out
     wall_s: float | None = None

@@ -149,8 +149,8 @@ def control_figures(control: Control) -> dict[str, Any]:
 
 def _stage_row(row: Row) -> dict[str, Any]:
     costs = {name: getattr(row, name) for name in COSTS_OF_STAGE}
-    key = {"why": row.why} if row.state == "left out" else {"key": row.ref.key}
-    return {"name": row.name, **key, "state": row.state, **costs}
+    why = {"why": row.why} if row.state == "left out" else {}
+    return {"name": row.name, "key": row.ref.key or None, "state": row.state, **why, **costs}
 
 
 def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
