@@ -37,6 +37,7 @@ from spectralzoom.storage.store import Ref, read_table
 
 PLOTS_FILE = "plots.csv"
 STRIP_PX = 2**20  # of class probabilities read at a time: 1 to 4 shards high
+MANY = 100  # times as far as usual, from which on the factor says no more
 
 
 def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
@@ -75,8 +76,9 @@ def map_warnings(plan: SurveyPlan, class_map: Ref | None) -> list[str]:
     warnings = list(plan.field.warnings)
     mean, spectra = (class_map and read_table(class_map.path / SPECTRA)["distances"]) or (0.0, 0.0)
     if max(mean, spectra) > UNLIKE:
-        what = f"its mean spectrum lies {mean:.1f}" if mean >= spectra else f"its spectra lie {spectra:.1f}"
-        far = f"{what} times as far from it as any part of it from the rest"
+        times = f"{max(mean, spectra):.1f}" if max(mean, spectra) < MANY else f"more than {MANY}"
+        what = "its mean spectrum lies" if mean >= spectra else "its spectra lie"
+        far = f"{what} {times} times as far from it as any part of it from the rest"
         warnings.append(f"the scene is unlike the training ({far}): the map may be wrong with confidence")
     return warnings
 
