@@ -242,6 +242,12 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
                 wait_for(f"survey/{name}")
             run: Any = run_deployment("survey/stopped", timeout=PATIENCE_S, poll_interval=0.5)
             assert run.state.is_completed()
+            end = time.monotonic() + PATIENCE_S
+            while (
+                "completed after" not in (tmp_path / "said").read_text()
+            ):  # the server knows it before the run says it
+                assert time.monotonic() < end
+                time.sleep(0.1)
             process.terminate()
             assert process.wait(PATIENCE_S) == 0
             with client() as asked:
