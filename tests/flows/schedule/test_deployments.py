@@ -245,7 +245,7 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
             end = time.monotonic() + PATIENCE_S
             while (
                 "completed after" not in (tmp_path / "said").read_text()
-            ):  # the server knows it before the run says it
+            ):  # the server knows before
                 assert time.monotonic() < end
                 time.sleep(0.1)
             process.terminate()
