@@ -243,9 +243,7 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
             run: Any = run_deployment("survey/stopped", timeout=PATIENCE_S, poll_interval=0.5)
             assert run.state.is_completed()
             end = time.monotonic() + PATIENCE_S
-            while (
-                "completed after" not in (tmp_path / "said").read_text()
-            ):  # the server knows before
+            while "completed after" not in (tmp_path / "said").read_text():  # the server knows before
                 assert time.monotonic() < end
                 time.sleep(0.1)
             process.terminate()
