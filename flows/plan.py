@@ -27,7 +27,7 @@ from spectralzoom.storage.parallel.pool import WorkerPool
 
 @dataclass(frozen=True, kw_only=True)
 class SecondPassRequest:
-    """How lines of a second pass are chosen by the scores of patches."""
+    """Choice of the lines of a second pass by the scores of patches."""
 
     planner: SecondPass | None  # None of a uniform scan or a raster
     scan_record: ScanPerformance | None  # table by which it is chosen; None without one
@@ -37,7 +37,7 @@ class SecondPassRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingPlan:
-    """What the network reads of a field, and its multiply-adds."""
+    """Reading of a field by the network, and its multiply-adds."""
 
     gains: PatchGains  # expected gain of patches by the policy of the settings
     costs: ReadingCosts

@@ -199,8 +199,8 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     """Write a polygon for each region of a class; return key, path and media type of both files.
 
     Outlines follow the sides of pixels. Columns are class, name and colour, with a place on the earth also hectares,
-    and with ``doses`` also dose, 0 for other classes. A shapefile has no
-    metadata: warnings about the map are another column of it. Raises ArchiveError: GDAL or the disk refuses.
+    and with ``doses`` also dose, 0 for other classes. A shapefile has no metadata: warnings about the map are another
+    column of it. Raises ArchiveError: GDAL or the disk refuses.
     """
     import geopandas
     import pyogrio

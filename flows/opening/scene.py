@@ -20,7 +20,7 @@ from spectralzoom.pipeline.simulator.scenes.built_in import built_in_scene
 from spectralzoom.pipeline.simulator.scenes.daylight import sun_elevation_deg
 from spectralzoom.pipeline.simulator.scenes.laws import FARM_SHAPE
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
-from spectralzoom.storage.readers.addresses import split_variable
+from spectralzoom.storage.addresses import split_variable
 from spectralzoom.storage.readers.cube_sources import ONE_FILE, machine_bytes
 from spectralzoom.storage.readers.labels import map_values
 from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file, open_scene_file

@@ -26,7 +26,7 @@ from spectralzoom.flows.publish.receipt_table import finding_rows, format_refere
 from spectralzoom.flows.publish.scores import error_matrix, format_false_classes, warnings_of
 from spectralzoom.flows.terminal.figures import format_percent, format_points
 from spectralzoom.pipeline.errors import visible
-from spectralzoom.storage.readers.addresses import split_variable
+from spectralzoom.storage.addresses import split_variable
 from spectralzoom.storage.runs import LINE_PRODUCTS
 
 LEAFLET = "vendor/leaflet-1.9.4"  # leafletjs.com, BSD-2-Clause: unchanged from npm's registry

@@ -21,7 +21,7 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_scene
 from spectralzoom.pipeline.simulator.scenes.laws import FARM_LAW, SCOUTING_LAW, TRIAL_LAW, built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.storage.readers.addresses import split_variable
+from spectralzoom.storage.addresses import split_variable
 from spectralzoom.storage.readers.label_files import (
     MatchedFiles,
     classes_of_files,

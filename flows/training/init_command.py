@@ -23,8 +23,8 @@ from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
 from spectralzoom.pipeline.errors import PipelineError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.toml_files import as_toml
+from spectralzoom.storage.addresses import split_variable
 from spectralzoom.storage.readers import label_files
-from spectralzoom.storage.readers.addresses import split_variable
 from spectralzoom.storage.readers.band_facts import bands_text
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.open_cubes import open_cube_source

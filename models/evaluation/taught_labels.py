@@ -64,6 +64,8 @@ def _taught_pixels(scene: RasterScene, weights: Description | Weights) -> NDArra
     most = -(-math.prod(scene.shape) // 8)
     try:
         bits = np.frombuffer(zlib.decompressobj().decompress(base64.b64decode(packed), most), np.uint8)
+        if len(bits) != most:
+            raise ValueError(f"{len(bits)} of {most} bytes")
     except (TypeError, ValueError, zlib.error) as error:
         why = f"the record of the weights has damaged trained pixels of {scene.name} ({error})"
         raise WeightsError(f"{why}; copy the file of weights again, or train them again") from None

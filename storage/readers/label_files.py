@@ -15,7 +15,7 @@ from pathlib import Path
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import SceneError, list_some
-from spectralzoom.storage.readers.addresses import split_variable
+from spectralzoom.storage.addresses import split_variable
 from spectralzoom.storage.readers.labels import Labels, found_classes, load_labels
 from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS
 from spectralzoom.storage.readers.own_files import stated_file

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text
 from spectralzoom.pipeline.signal.calibrate import check_frames
-from spectralzoom.storage.readers.addresses import split_variable
+from spectralzoom.storage.addresses import split_variable
 from spectralzoom.storage.readers.array_cubes import open_arrays
 from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, find_zarr_store
 from spectralzoom.storage.readers.band_facts import Bands

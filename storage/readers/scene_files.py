@@ -19,7 +19,7 @@ from spectralzoom.pipeline.errors import EmptySceneError, SceneError
 from spectralzoom.pipeline.geometry.grid import cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from spectralzoom.pipeline.signal.line_faults import CURE, DARK_LINE, counted, leave_out
-from spectralzoom.storage.readers.addresses import split_variable
+from spectralzoom.storage.addresses import split_variable
 from spectralzoom.storage.readers.band_facts import Bands, bands_text
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
